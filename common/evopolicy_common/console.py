@@ -100,11 +100,8 @@ def filled_table(headings: Sequence[str], rows: Sequence[Sequence[str]]) -> Tabl
 
 
 def table(*headings: str, right: Collection[str] = (), whole: Collection[str] = ()) -> Table:
-    """A table without truncation: on narrow terminals cells fold, because other commands need their full content.
-
-    `right`: headings of right-aligned columns. `whole`: headings of columns whose cells never fold, as people copy
-    them.
-    """
+    """A table whose cells fold on narrow terminals, as other commands need their full content. `right`:
+    headings of right-aligned columns. `whole`: headings of columns that never fold, as people copy them."""
     made = NarrowTable()
     for heading in headings:
         justify: JustifyMethod = "right" if heading in right else "left"
@@ -128,5 +125,5 @@ def listing(
 
 def terminal(*, stderr: bool = False) -> Terminal:
     """A console as wide as the terminal, or `WIDTH` columns without one."""
-    found = Terminal(stderr=stderr)
-    return found if found.is_terminal else Terminal(stderr=stderr, width=WIDTH)
+    console = Terminal(stderr=stderr)
+    return console if console.is_terminal else Terminal(stderr=stderr, width=WIDTH)

@@ -23,8 +23,8 @@ def __getattr__(name: str) -> Any:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     import msgspec
 
-    found = globals()[name] = (msgspec.DecodeError, UnicodeDecodeError, RecursionError)
-    return found
+    kinds = globals()[name] = (msgspec.DecodeError, UnicodeDecodeError, RecursionError)
+    return kinds
 
 
 class EvopolicyError(Exception):
@@ -45,10 +45,7 @@ class ConfigError(EvopolicyError):
 
 
 class MachineError(ConfigError):
-    """The machine refuses a resource that it may provide later, as with a full or read-only disk.
-
-    Exit code 1, not 2, so that a process manager restarts the program.
-    """
+    """The machine refuses a resource that it may provide later. Exit code 1: a process manager restarts."""
 
 
 class BundleError(EvopolicyError):
@@ -81,8 +78,7 @@ class WorkerError(EvopolicyError):
 
 
 class BrokenEnvironmentError(WorkerError):
-    """An environment breaks its word: it raises, hangs, or leaves its spaces. Neither the policy nor the worker is to
-    blame."""
+    """An environment raises, hangs, or leaves its spaces. Neither the policy nor the worker is to blame."""
 
 
 class SlotDiedError(WorkerError):

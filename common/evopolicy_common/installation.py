@@ -1,5 +1,4 @@
-"""This installation in hints that can be pasted: its programs as they were called, and the command that adds an
-extra."""
+"""Hints that can be pasted: our programs as they were called, and the command that adds an extra."""
 
 from __future__ import annotations
 
@@ -27,7 +26,7 @@ _COMMAND = re.compile(
 
 def as_called(text: str) -> str:
     """The text with our commands as they can be called from here, such as `.venv/bin/evopolicy report`."""
-    return _COMMAND.sub(lambda found: program(found[0]), text) if "evopolicy" in text else text
+    return _COMMAND.sub(lambda match: program(match[0]), text) if "evopolicy" in text else text
 
 
 def program(name: str) -> str:

@@ -60,13 +60,7 @@ class Refusal(StrEnum):
 
 
 RUN_OVER = frozenset(
-    {
-        Refusal.BAD_TOKEN,
-        Refusal.RUN_CANCELLED,
-        Refusal.RUN_CLOSED,
-        Refusal.RUN_FINISHED,
-        Refusal.UNKNOWN_RUN,
-    }
+    {Refusal.BAD_TOKEN, Refusal.RUN_CANCELLED, Refusal.RUN_CLOSED, Refusal.RUN_FINISHED, Refusal.UNKNOWN_RUN}
 )
 """For a run's gateway: no further request of this run is served."""
 
@@ -74,11 +68,6 @@ NOT_NOW = frozenset({Refusal.NO_WORKER, Refusal.UNAVAILABLE})
 """Retry: no worker has described the environment yet, or the coordinator's disk is full."""
 
 WRONG_SETTINGS = frozenset(
-    {
-        Refusal.BAD_REQUEST,
-        Refusal.BAD_SETTINGS,
-        Refusal.INVALID_ENV_INSTANCE,
-        Refusal.INVALID_SETTINGS,
-    }
+    {Refusal.BAD_REQUEST, Refusal.BAD_SETTINGS, Refusal.INVALID_ENV_INSTANCE, Refusal.INVALID_SETTINGS}
 )
 """For an operator: an option of the command is the cause."""

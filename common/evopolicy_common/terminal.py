@@ -49,8 +49,7 @@ _NUMBERS = re.compile(r"[-+]?[0-9][0-9.]*(?:e[-+]?[0-9]+)?(?: to [-+]?[0-9][0-9.
 
 
 def csv_cell(value: Any) -> Any:
-    """The value for a CSV file: a text is `harmless`, with an apostrophe in front where a spreadsheet would take it for
-    a formula; empty for None."""
+    """The value for a CSV file: empty for None; texts `harmless`, an apostrophe before formulas."""
     if value is None:
         return ""
     if not isinstance(value, str):
@@ -60,21 +59,15 @@ def csv_cell(value: Any) -> Any:
     return f"'{text}" if formula else text
 
 
-_REASONS = ("why", "error", "detail")
-
-
 def event_text(event: str, values: Mapping[str, Any]) -> str:
-    """An event of a log as people read it: `slot was stopped from outside (2 s): …`.
-
-    Values named `why`, `error` or `detail` are its reason, seconds (`…_s`) need no name, and empty ones are left out.
-    """
+    """An event of a log as people read it: `slot was stopped from outside (2 s): …`. Values named `why`,
+    `error` or `detail` are its reason, seconds (`…_s`) need no name, and empty ones are left out."""
     given = {name: value for name, value in values.items() if value not in ("", None)}
+    reasons = [str(given.pop(name)) for name in ("why", "error", "detail") if name in given]
     details = ", ".join(
         f"{value} s" if name.endswith("_s") else f"{name.replace('_', ' ')} {value}"
         for name, value in given.items()
-        if name not in _REASONS
     )
-    reasons = [str(given[name]) for name in _REASONS if name in given]
     return ": ".join([event + (f" ({details})" if details else ""), *reasons])
 
 
@@ -98,16 +91,13 @@ def duration(seconds: float | None) -> str:
     return f"{seconds:.0f} s"
 
 
-def _shown(found: re.Match[str]) -> str:
+def _shown(match: re.Match[str]) -> str:
     # Surrogates, which no stream can encode, are not printable either.
-    return found[0] if found[0].isprintable() else "\N{REPLACEMENT CHARACTER}"
+    return match[0] if match[0].isprintable() else "\N{REPLACEMENT CHARACTER}"
 
 
 def say(text: str, *, err: bool = False) -> None:
-    """Prints `text` and a newline on stdout, or on stderr, where the output is dropped when the reader is gone.
-
-    Commands of ours in it are printed `as_called`.
-    """
+    """Prints `text`, with our commands `as_called`, on stdout, or on stderr, whose reader may be gone."""
     with contextlib.suppress(BrokenPipeError) if err else contextlib.nullcontext():
         print(harmless(as_called(text)), file=sys.stderr if err else sys.stdout, flush=True)
 
@@ -133,10 +123,10 @@ def say_json(value: Any, *, indent: bool = True) -> None:
     print(_ODD.sub(_escaped, text), flush=True)
 
 
-def _escaped(found: re.Match[str]) -> str:
+def _escaped(match: re.Match[str]) -> str:
     import json
 
-    return found[0] if found[0].isprintable() else json.dumps(found[0])[1:-1]
+    return match[0] if match[0].isprintable() else json.dumps(match[0])[1:-1]
 
 
 class _WatchedStdout(io.FileIO):
@@ -156,10 +146,8 @@ class _WatchedStdout(io.FileIO):
 
 
 def open_streams() -> None:
-    """Opens `/dev/null` for missing stdin, stdout or stderr (`2>&-`).
-
-    Otherwise the next file that is opened, perhaps a database, would receive that output.
-    """
+    """Opens `/dev/null` for missing stdin, stdout or stderr (`2>&-`): the next file that is opened, perhaps a
+    database, would receive that output."""
     for fd, (name, mode) in enumerate((("stdin", "r"), ("stdout", "w"), ("stderr", "w"))):
         try:
             os.fstat(fd)

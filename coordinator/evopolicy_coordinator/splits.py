@@ -15,6 +15,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import hmac
+import itertools
 import secrets
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -61,8 +62,7 @@ class EnvironmentSplits(msgspec.Struct, frozen=True, kw_only=True):
 
     def cases(self, split: Split) -> tuple[Case, ...]:
         """The cases of `split`, in order of their ids."""
-        cases: tuple[Case, ...] = getattr(self, split)
-        return cases
+        return {"train": self.train, "validation": self.validation, "heldout": self.heldout}[split]
 
     def hashes(self) -> dict[str, str]:
         """SHA-256 (hex) of each split's cases by split name, and of their files by file name."""
@@ -94,14 +94,10 @@ def in_world(env: str, key: str, cases: dict[Split, tuple[Case, ...]]) -> dict[S
 
 
 def _draw(secret: bytes, suite: str, env: str, split: Split, index: int, taken: set[int]) -> int:
-    draw = 0
-    while True:
-        name = f"{suite}|{env}|{split}|{index}|{draw}".encode()
-        digest = hmac.digest(secret, name, "sha256")
-        seed = int.from_bytes(digest[:4], "big") % SEED_LIMIT
-        if seed not in taken:
-            return seed
-        draw += 1
+    names = (f"{suite}|{env}|{split}|{index}|{draw}".encode() for draw in itertools.count())
+    digests = (hmac.digest(secret, name, "sha256") for name in names)
+    seeds = (int.from_bytes(digest[:4], "big") % SEED_LIMIT for digest in digests)
+    return next(seed for seed in seeds if seed not in taken)
 
 
 def public_secret(seed: int) -> bytes:
@@ -137,20 +133,15 @@ def secret_of(state: Path, *, unjailed: bool = False) -> tuple[bytes, str]:
 
 
 def renew_secrets(state: Path) -> str:
-    """Replaces the secrets by a new one, for good, and returns the new epoch's public name.
-
-    Runs keep their cases in the database, so unfinished runs continue, and finished ones can still be verified.
-    """
+    """Replaces the secrets by a new one, for good, and returns the new epoch's public name. Runs keep their
+    cases in the database, so unfinished ones continue, and finished ones can still be verified."""
     for name in (SECRET, UNJAILED_SECRET):
         (state / name).unlink(missing_ok=True)
     return epoch_of(load_or_create_secret(state / SECRET))
 
 
 def load_or_create_secret(path: Path) -> bytes:
-    """Returns the 256 bits in the file (mode 0600), creating it on first use.
-
-    Raises ConfigError when it is not 32 bytes long, or others may read it.
-    """
+    """The 256 bits in the file, made on first use. Raises ConfigError if too short, or readable by others."""
     try:
         data = path.read_bytes()
     except FileNotFoundError:
@@ -169,7 +160,7 @@ def load_or_create_secret(path: Path) -> bytes:
 
 def load(folder: Path) -> tuple[EnvironmentSplits | None, list[str]]:
     """Returns the splits in one environment's folder (None when unreadable) and descriptions of their faults."""
-    findings: list[str] = []
+    faults: list[str] = []
     contents: dict[Split, SplitFile] = {}
     hashes: dict[str, str] = {}
     for split in SPLITS:
@@ -177,47 +168,38 @@ def load(folder: Path) -> tuple[EnvironmentSplits | None, list[str]]:
         try:
             contents[split], hashes[name] = read_split_file(folder / name)
         except ConfigError as error:
-            findings.append(str(error))
+            faults.append(str(error))
     if len(contents) < len(SPLITS):
-        return None, findings
+        return None, faults
+    env, cases = contents["train"].env, {split: content.cases for split, content in contents.items()}
     for split, content in contents.items():
-        findings.extend(_file_findings(folder, split, content, contents["train"].env))
-    findings.extend(overlaps({split: content.cases for split, content in contents.items()}))
-    splits = EnvironmentSplits(
-        env=contents["train"].env,
-        secret=all(content.secret is True for content in contents.values()),
-        epoch="",
-        files=hashes,
-        **{split: content.cases for split, content in contents.items()},
+        faults += _file_faults(folder, split, content, env)
+    secret = all(content.secret is True for content in contents.values())
+    return EnvironmentSplits(env=env, secret=secret, epoch="", files=hashes, **cases), faults + overlaps(
+        cases
     )
-    return splits, findings
 
 
-def _file_findings(folder: Path, split: Split, content: SplitFile, env: str) -> list[str]:
-    name = f"{folder.name}/{FILE_STEMS[split]}.json"
-    findings = []
-    if content.split not in (split, FILE_STEMS[split]):
-        findings.append(f"{name} says it is split {content.split!r}")
-    if content.env != env:
-        findings.append(f"{name} is of environment {content.env!r}, train.json of {env!r}")
-    names = (folder_name(content.env), earlier_folder_name(content.env))
-    if folder.name not in names and not folder.as_posix().endswith(f"/{content.env}"):
-        findings.append(
-            f"{name} is of environment {content.env!r}, which belongs in {folder_name(content.env)}/ or {content.env}/"
-        )
-    if not content.cases:
-        findings.append(f"{name} has no cases")
-    return findings
+def _file_faults(folder: Path, split: Split, content: SplitFile, env: str) -> list[str]:
+    own = content.env
+    in_place = folder.name in (folder_name(own), earlier_folder_name(own)) or folder.as_posix().endswith(
+        f"/{own}"
+    )
+    faults = (
+        (content.split not in (split, FILE_STEMS[split]), f"says it is split {content.split!r}"),
+        (own != env, f"is of environment {own!r}, train.json of {env!r}"),
+        (not in_place, f"is of environment {own!r}, which belongs in {folder_name(own)}/ or {own}/"),
+        (not content.cases, "has no cases"),
+    )
+    return [f"{folder.name}/{FILE_STEMS[split]}.json {fault}" for applies, fault in faults if applies]
 
 
 class SplitSource:
     """A coordinator's source of splits: a data folder, or its secret."""
 
     def __init__(self, *, data: Path | None, secret: bytes, journal: Path | None = None) -> None:
-        """`data` None: derive all splits from `secret`. `journal`: of worlds.
-
-        Raises ConfigError when `data` is not a folder.
-        """
+        """`data` None: derive all splits. `journal`: of worlds. Raises ConfigError when `data` is no
+        folder."""
         if data is not None and not data.is_dir():
             raise ConfigError(f"--data {data} is not a folder")
         self._data = data
@@ -251,11 +233,11 @@ class SplitSource:
                 f" them from {self._data}, so all runs share them"
             )
         folder = folder_of(self._data, env)
-        splits, findings = load(folder)
-        if splits is None or findings:
-            more = f" (and {len(findings) - 1} more)" if len(findings) > 1 else ""
+        splits, faults = load(folder)
+        if splits is None or faults:
+            more = f" (and {len(faults) - 1} more)" if len(faults) > 1 else ""
             raise ConfigError(
-                f"splits of {env} in {folder} cannot be used: {findings[0]}{more}; see `evopolicy data check`"
+                f"splits of {env} in {folder} cannot be used: {faults[0]}{more}; see `evopolicy data check`"
             )
         known = {(case.options or {}).get(OPTION) for split in SPLITS for case in splits.cases(split)}
         if unchanged(env) != env and (len(known) > 1 or not KEY.fullmatch(str(*known))):
@@ -266,16 +248,19 @@ class SplitSource:
             )
         if splits.env != env:
             raise ConfigError(f"{folder} holds the splits of {splits.env!r}, not of {env!r}")
-        cut = {split: _cut(folder, split, splits.cases(split), counts.get(split)) for split in SPLITS}
-        hidden = cases_hash((*splits.validation, *splits.heldout))
-        epoch = f"files-{hidden[:16]}"
+        for split, count in counts.items():
+            if count > (n := len(splits.cases(split))):
+                raise ConfigError(
+                    f"{folder / FILE_STEMS[split]}.json has {n} cases, and {count} are requested; extend the file or"
+                    " request fewer"
+                )
+        cut = {split: splits.cases(split)[: counts.get(split)] for split in SPLITS}
+        epoch = f"files-{cases_hash((*splits.validation, *splits.heldout))[:16]}"
         return EnvironmentSplits(env=env, secret=splits.secret, epoch=epoch, files=splits.files, **cut)
 
     def further(self, suite: str, env: str, name: str, n: int, taken: Sequence[Case]) -> FurtherCases:
-        """Derives `n` further hidden cases, equal for equal `name`, none with a seed of `taken`.
-
-        Raises ConfigError when this source's cases come from files.
-        """
+        """`n` further hidden cases, equal for equal `name`, without `taken`. Raises ConfigError with
+        files."""
         if self._data is not None:
             raise ConfigError(
                 f"this coordinator takes its cases from {self._data} and derives none: name a folder with further cases"
@@ -290,14 +275,3 @@ class SplitSource:
         if unchanged(env) == env:
             return ""
         return worlds.key_of(self._secret, env, worlds.number_of(env, self._secret, self._journal))
-
-
-def _cut(folder: Path, split: Split, cases: Sequence[Case], count: int | None) -> tuple[Case, ...]:
-    if count is None:
-        return tuple(cases)
-    if count > len(cases):
-        raise ConfigError(
-            f"{folder / FILE_STEMS[split]}.json has {len(cases)} cases, and {count} are requested; extend the file or"
-            " request fewer"
-        )
-    return tuple(cases[:count])

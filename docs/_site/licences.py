@@ -19,8 +19,7 @@ from typing import Any
 import msgspec
 from packaging.requirements import Requirement
 
-from evopolicy_common.catalogue.installs import installs
-from evopolicy_common.catalogue.licences import BASE, UNKNOWN, Licence, assets, packages
+from evopolicy_common.catalogue.installs import BASE, UNKNOWN, Licence, assets, installs, packages
 
 TOP = Path(__file__).parents[2]
 DATA = TOP / "common" / "evopolicy_common" / "catalogue" / "licences.json"

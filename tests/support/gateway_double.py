@@ -456,7 +456,7 @@ async def answering(folder: Path, double: Double) -> AsyncIterator[Credentials]:
     """The double listening on a unix socket in `folder`; the credentials of its gateway."""
     (folder / "passwords").write_text("gateway:secret\n")
     endpoint = f"unixsock-stream/{folder}/sock"
-    config = transport.server_config(CLUSTER, [endpoint], folder / "passwords", {"gateway": "gateway"})
+    config = transport.server_config(CLUSTER, [endpoint], folder / "passwords", [("gateway", "gateway")])
     await double.start(folder / "coordinator")
     try:
         async with transport.serve(config, double.on_queries) as server:

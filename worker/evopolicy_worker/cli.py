@@ -33,7 +33,7 @@ from evopolicy_common.processes.preflight import check_scratch
 from evopolicy_common.processes.scratch import scratch_folder
 from evopolicy_common.terminal import say, say_json
 from evopolicy_common.wire import credentials, keys, transport
-from evopolicy_common.wire.ready import read_ready
+from evopolicy_common.wire.credentials import read_ready
 from evopolicy_worker import check_env, descriptions, environments, setup
 from evopolicy_worker.capabilities import Capabilities, log_missing
 from evopolicy_worker.environments.interface.calls import USUAL, Limits

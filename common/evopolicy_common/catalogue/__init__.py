@@ -65,8 +65,7 @@ class _Shipped(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class _Family(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A file of `families/`. An environment's id is `prefix` plus its key; the key is Gymnasium's id unless the row
-    differs."""
+    """A file of `families/`. An id is `prefix` plus a key, Gymnasium's id unless the row differs."""
 
     family: str
     title: str
@@ -97,38 +96,34 @@ class _Loaded(msgspec.Struct, frozen=True):
 def _load() -> _Loaded:
     here = files(__package__)
     shipped = msgspec.convert(tomllib.loads((here / "catalogue.toml").read_text("utf-8")), _Shipped)
-    found = {entry.id: entry for entry in shipped.environment}
+    rows = {entry.id: entry for entry in shipped.environment}
     grouped = {suite.name: suite for suite in shipped.suite}
     titles = dict(shipped.families)
     places = [item for item in (here / "families").iterdir() if item.name.endswith(".toml")]
     for place in sorted(places, key=lambda item: item.name):
         family = msgspec.convert(tomllib.loads(place.read_text("utf-8")), _Family)
-        rows = {entry.id: entry for entry in family.entries()}
+        own = {entry.id: entry for entry in family.entries()}
         titles.setdefault(family.family, family.title)
-        grouped[family.family] = Suite(name=family.family, title=family.title, environments=tuple(rows))
+        grouped[family.family] = Suite(name=family.family, title=family.title, environments=tuple(own))
         grouped |= {suite.name: suite for suite in family.suite}
-        found |= {env_id: row for env_id, row in rows.items() if env_id not in found}
+        rows |= {env_id: row for env_id, row in own.items() if env_id not in rows}
     for name, suite in grouped.items():
         parts = [grouped[each].environments if each in grouped else (each,) for each in suite.environments]
         members = tuple(itertools.chain.from_iterable(parts))
         grouped[name] = msgspec.structs.replace(suite, environments=members)
     core16 = grouped["core16"]
-    played: dict[str, tuple[str, ...]] = {each: (each, *worlds.ids(each)) for each in core16.environments}
-    with_worlds: dict[str, Entry] = {}
-    for env_id, row in found.items():
-        with_worlds[env_id] = row
-        for n, world in enumerate(played.get(env_id, ())[1:], 1):
-            with_worlds[world] = msgspec.structs.replace(
+    loaded: dict[str, Entry] = {}
+    for env_id, row in rows.items():
+        loaded[env_id] = row
+        for n, world in enumerate(worlds.ids(env_id) if env_id in core16.environments else (), 1):
+            loaded[world] = msgspec.structs.replace(
                 row, id=world, title=f"{row.label}, world {n}", published_steps=None, demand=None, world=n
             )
-    found = with_worlds
-    all_played = tuple(itertools.chain.from_iterable(played.values()))
-    title = "Core16 and its worlds"
+    with_worlds = tuple(name for each in core16.environments for name in (each, *worlds.ids(each)))
     grouped["core16-worlds"] = msgspec.structs.replace(
-        core16, name="core16-worlds", title=title, environments=all_played
+        core16, name="core16-worlds", title="Core16 and its worlds", environments=with_worlds
     )
-    prefixes = frozenset(env_id.partition("/")[0] for env_id in found)
-    return _Loaded(found, grouped, titles, prefixes)
+    return _Loaded(loaded, grouped, titles, frozenset(env_id.partition("/")[0] for env_id in loaded))
 
 
 @cache
@@ -173,16 +168,13 @@ def is_shipped(env_id: str) -> bool:
 
 @cache
 def plugins() -> dict[str, tuple[Entry, str]]:
-    """By id, the environments of installed packages, with the file's path; no package is imported.
-
-    Raises ConfigError for a package whose file is missing or is no environment file.
-    """
-    found: dict[str, tuple[Entry, str]] = {}
+    """By id, the environments of installed packages, with the file's path. Raises ConfigError."""
+    offered: dict[str, tuple[Entry, str]] = {}
     for point in metadata.entry_points(group=ENTRY_POINTS):
         package, _, name = point.value.partition(":")
-        spec = find_spec(package.partition(".")[0])
-        places = list(spec.submodule_search_locations or ()) if spec is not None else []
-        inner = package.split(".")[1:]
+        top, *inner = package.split(".")
+        spec = find_spec(top)
+        places = (spec.submodule_search_locations or ()) if spec is not None else ()
         paths = [Path(place, *inner, name.strip()) for place in places]
         path = next((each for each in paths if each.is_file()), None)
         if path is None or path.suffix != ".toml":
@@ -190,26 +182,26 @@ def plugins() -> dict[str, tuple[Entry, str]]:
                 f"entry point {point.name} = {point.value!r} of {ENTRY_POINTS} names no environment file in the"
                 ' package: use the form "package:FILE.toml", and ship the file as package data'
             )
-        found |= {entry.id: (entry, str(path)) for entry in _checked(read_file(path), path)}
-    return found
+        offered |= {entry.id: (entry, str(path)) for entry in _checked(read_file(path), path)}
+    return offered
 
 
 def add(path: Path) -> list[str]:
     """Adds an environment file to this process and returns its ids. Raises ConfigError for errors in it."""
-    found = _checked(read_file(path), path)
-    _added.update((entry.id, (entry, str(path.absolute()))) for entry in found)
-    return [entry.id for entry in found]
+    given = {entry.id: (entry, str(path.absolute())) for entry in _checked(read_file(path), path)}
+    _added.update(given)
+    return list(given)
 
 
-def _checked(found: tuple[Entry, ...], path: Path) -> tuple[Entry, ...]:
-    for each in found:
+def _checked(defined: tuple[Entry, ...], path: Path) -> tuple[Entry, ...]:
+    for each in defined:
         prefix = each.id.partition("/")[0]
         if is_shipped(each.id) or ("/" in each.id and prefix in _load().prefixes):
             raise ConfigError(
                 f"environment file {path}, environment {each.id}: ids that begin with {prefix}/ ship with evopolicy;"
                 " give yours a prefix of its own"
             )
-    return found
+    return defined
 
 
 def source_of(env_id: str) -> str:
@@ -238,16 +230,14 @@ def is_foreign(env_id: str) -> bool:
 
 
 def entry(env_id: str) -> Entry:
-    """The entry of `env_id`, perhaps with only its id if foreign. Raises ConfigError with similar names for a wrong
-    id."""
-    if found := known(env_id) or (Entry(id=env_id) if is_foreign(env_id) else None):
-        return found
+    """The entry of `env_id`, with its id alone if foreign. Raises ConfigError with similar names."""
+    if row := known(env_id) or (Entry(id=env_id) if is_foreign(env_id) else None):
+        return row
     raise ConfigError(f"no environment {env_id!r} in the catalogue{near(env_id)}")
 
 
 def suite_of(env_id: str) -> Suite:
-    """The first suite with `env_id`: its numbers are the defaults of a run on it. Raises ConfigError as `entry`
-    does."""
+    """The first suite with `env_id`: its numbers are a run's defaults. Raises ConfigError as `entry` does."""
     entry(env_id)
     return next((suite for suite in suites().values() if env_id in suite.environments), OTHER)
 

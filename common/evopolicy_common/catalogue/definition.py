@@ -88,8 +88,7 @@ class Entry(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     deterministic: bool = True
     """False when even a fresh environment does not repeat an episode from its seed and actions."""
     data: tuple[str, ...] = ()
-    """Files and folders that the environment reads besides its modules, relative to its file's folder; read from a
-    file, absolute."""
+    """Files and folders besides its modules, relative to its file; read from a file, absolute."""
     world: int = 0
     """Which world of an environment it is (see `worlds`); 0: the environment itself."""
     info_strings: tuple[str, ...] = ()
@@ -187,16 +186,16 @@ def _task(where: str, path: Path, fields: dict[str, Any], task_file: object) -> 
     what = f"{where}: task_file {task_file!r}"
     folder = path.parent.resolve()
     try:
-        found = (folder / task_file).resolve()
+        place = (folder / task_file).resolve()
     except (OSError, ValueError) as error:
         raise ConfigError(f"{what} cannot be read: {error}") from error
     # Agents read the text: a package's file must not name a secret of this machine.
-    if not found.is_relative_to(folder):
+    if not place.is_relative_to(folder):
         raise ConfigError(
-            f"{what} is {found}, outside the environment file's folder {folder}: copy the text into that folder"
+            f"{what} is {place}, outside the environment file's folder {folder}: copy the text into that folder"
         )
     try:
-        return read_given(found, what, MAX_FILE_BYTES).decode()
+        return read_given(place, what, MAX_FILE_BYTES).decode()
     except UnicodeDecodeError as error:
         raise ConfigError(f"{what} is not UTF-8: {error}; save it as UTF-8") from error
 
@@ -208,7 +207,7 @@ def _data(where: str, path: Path, names: tuple[str, ...]) -> tuple[str, ...]:
             f"{where}: data has {len(names)} names; {MAX_DATA} are the limit: name their folder"
         )
     folder = path.parent.resolve()
-    found: list[str] = []
+    paths: list[str] = []
     for name in names:
         place = folder / name
         real = place.resolve() if "\0" not in name else folder
@@ -220,8 +219,8 @@ def _data(where: str, path: Path, names: tuple[str, ...]) -> tuple[str, ...]:
             )
         if not real.exists():
             raise ConfigError(f"{where}: data {name[:80]!r}: there is no {place}")
-        found.append(str(path.parent.absolute() / name))
-    return tuple(found)
+        paths.append(str(path.parent.absolute() / name))
+    return tuple(paths)
 
 
 def _fault(entry: Entry) -> str:

@@ -53,9 +53,9 @@ class Install(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     python: tuple[str, str] = ("3.11", "3.14")
     """First Python version it was tested with, and the first that it was not."""
     assets: Mapping[str, tuple[str, ...]] = {}
-    """Files in its packages that may have another licence than the package: ROMs, sprites, meshes, maps. Each
-    with two texts, the words that state its licence and the installed file that has them, below
-    `site-packages`; with none where no file states one."""
+    """Files in its packages that may have another licence than the package: ROMs, sprites, meshes. Each with
+    the words that state its licence and the installed file that has them; with none where no file states
+    one."""
 
 
 class Made(msgspec.Struct, frozen=True, kw_only=True):
@@ -90,8 +90,7 @@ def family_of(env_id: str) -> str:
 
 
 def apart(families: Iterable[str] = ()) -> list[str]:
-    """Requirements (`NAME==VERSION`) that pip installs with `--no-deps` for the families; by default for all that
-    share an installation."""
+    """Requirements that pip installs with `--no-deps` for families; by default for all that share."""
     rows = [each for name, each in installs().items() if name in families or not (families or each.pins)]
     return [f"{name}=={version}" for each in rows for name, version in each.apart.items()]
 
@@ -106,13 +105,13 @@ def own() -> str:
     """This interpreter's installation as `NAME@DIGEST`: the families for which `setup` made it, joined with `+`, or
     else `base`; and 12 hex digits of the SHA-256 of the names and versions of all packages in it. Tells no path."""
     here = read(Path(sys.prefix))
-    found = {
+    names = {
         each.name.removesuffix(".dist-info")
         # Unlike `Path.is_dir`, this raises nothing for a folder of PYTHONPATH that may not be looked at.
         for path in filter(os.path.isdir, sys.path)
         for each in Path(path).glob("*.dist-info")
     }
-    digest = hashlib.sha256("\n".join(sorted(found)).encode()).hexdigest()
+    digest = hashlib.sha256("\n".join(sorted(names)).encode()).hexdigest()
     return f"{'+'.join(here.families) if here is not None else 'base'}@{digest[:12]}"
 
 
@@ -150,14 +149,14 @@ def made() -> list[Made]:
         folders = {each.resolve() for each in root().iterdir()}
     except OSError:
         return []
-    found = [made for each in folders if (made := read(each)) is not None and made.ready]
-    return sorted((each for each in found if Path(each.python).exists()), key=_finished_at, reverse=True)
+    ready = [made for each in folders if (made := read(each)) is not None and made.ready]
 
+    def finished_at(made: Made) -> float:
+        with contextlib.suppress(OSError):
+            return Path(made.folder, MARK).stat().st_mtime
+        return 0.0
 
-def _finished_at(made: Made) -> float:
-    with contextlib.suppress(OSError):
-        return Path(made.folder, MARK).stat().st_mtime
-    return 0.0
+    return sorted((each for each in ready if Path(each.python).exists()), key=finished_at, reverse=True)
 
 
 def divided(env_ids: Iterable[str]) -> dict[str, list[str]]:
@@ -167,26 +166,68 @@ def divided(env_ids: Iterable[str]) -> dict[str, list[str]]:
     Raises ConfigError that names the `setup` line for ids that nothing here can play, and for a virtual environment of
     another version of evopolicy.
     """
-    found: dict[str, list[str]] = {}
+    by_python: dict[str, list[str]] = {}
     lacking: dict[str, list[str]] = {}
     for env_id in env_ids:
         family = family_of(env_id)
         if not family or is_here(family):
-            found.setdefault(sys.executable, []).append(env_id)
-            continue
-        playing = [each for each in made() if family in each.families]
-        if not playing:
+            by_python.setdefault(sys.executable, []).append(env_id)
+        elif (one := next((each for each in made() if family in each.families), None)) is None:
             lacking.setdefault(family, []).append(env_id)
-            continue
-        one = playing[0]
-        if one.version != (ours := evopolicy_common.__version__):
+        elif one.version != (ours := evopolicy_common.__version__):
             again = f"make it again with `{setup_line(family)}`"
             raise ConfigError(f"{one.folder} has evopolicy {one.version}, and this is {ours}: {again}")
-        found.setdefault(one.python, []).append(env_id)
+        else:
+            by_python.setdefault(one.python, []).append(env_id)
     if lacking:
         remedies = "; ".join(
             f"{env_ids[0]}{f' and {len(env_ids) - 1} more' * (len(env_ids) > 1)}: {setup_line(family)}"
             for family, env_ids in lacking.items()
         )
         raise ConfigError(f"not installed on this machine: {remedies}")
-    return found
+    return by_python
+
+
+# Licences of the packages that evopolicy requires directly, and of their assets, as the packages state them:
+# `docs/_site/licences.py` writes `licences.json` from installed metadata.
+
+UNKNOWN = "unknown"
+"""Licence of what a package contains without stating one for it."""
+BASE = ("core", "coordinator", "gateway")
+"""Parts of the software besides families, by which packages are used."""
+
+
+class Licence(msgspec.Struct, frozen=True, kw_only=True):
+    """The licence of a package, or of assets in it."""
+
+    what: str
+    """Name of the package, or the assets in words."""
+    version: str = ""
+    """Empty for assets."""
+    licence: str = UNKNOWN
+    used_by: tuple[str, ...]
+    """Keys of `installs()`, and names of `BASE`."""
+
+
+@cache
+def packages() -> tuple[Licence, ...]:
+    """Of all parts, by name and version."""
+    data = files(__package__).joinpath("licences.json").read_bytes()
+    return msgspec.json.decode(data, type=tuple[Licence, ...])
+
+
+@cache
+def assets() -> tuple[Licence, ...]:
+    """Of all families, in the order of `installs.toml`."""
+    return tuple(
+        Licence(what=what, licence=stated[0] if stated else UNKNOWN, used_by=(family,))
+        for family, row in installs().items()
+        for what, stated in row.assets.items()
+    )
+
+
+def licences(parts: Iterable[str]) -> tuple[Licence, ...]:
+    """Packages and assets of some families, each with those of the families that use it."""
+    wanted = frozenset(parts)
+    used = ((each, tuple(name for name in each.used_by if name in wanted)) for each in packages() + assets())
+    return tuple(msgspec.structs.replace(each, used_by=names) for each, names in used if names)

@@ -18,8 +18,8 @@ _ID = re.compile(r"(.+)@w([1-9][0-9]*)")
 
 def unchanged(env_id: str) -> str:
     """The environment that a world alters; any other id is returned as it is."""
-    found = _ID.fullmatch(env_id)
-    return found[1] if found else env_id
+    match = _ID.fullmatch(env_id)
+    return match[1] if match else env_id
 
 
 def ids(env_id: str) -> tuple[str, ...]:

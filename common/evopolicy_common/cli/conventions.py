@@ -74,19 +74,15 @@ def bytes_text(n: float) -> str:
     return f"{n:.1f} TiB"
 
 
-def _harmless_values(_: Any, __: str, event: MutableMapping[str, Any]) -> MutableMapping[str, Any]:
-    """Removes unprintable characters: any value may contain text of a policy or an agent. JSON lines escape it."""
-    for name, value in event.items():
-        if isinstance(value, str):
-            event[name] = harmless(value)
-    return event
-
-
 def setup_logging(level: str = "info") -> None:
     """Configures structured logs on stderr: readable on a terminal, JSON lines otherwise."""
     import logging
 
     from evopolicy_common.logs import structlog
+
+    def harmless_values(_: Any, __: str, event: MutableMapping[str, Any]) -> MutableMapping[str, Any]:
+        # Any value may contain text of a policy or an agent. JSON lines escape it.
+        return {name: harmless(value) if isinstance(value, str) else value for name, value in event.items()}
 
     terminal = sys.stderr.isatty()
     structlog.configure(
@@ -95,7 +91,7 @@ def setup_logging(level: str = "info") -> None:
             structlog.processors.add_log_level,
             structlog.processors.TimeStamper(fmt="iso" if not terminal else "%H:%M:%S", utc=not terminal),
             structlog.processors.format_exc_info,
-            *((_harmless_values,) if terminal else ()),
+            *((harmless_values,) if terminal else ()),
             structlog.dev.ConsoleRenderer() if terminal else structlog.processors.JSONRenderer(),
         ],
         wrapper_class=structlog.make_filtering_bound_logger(getattr(logging, level.upper())),
@@ -134,8 +130,7 @@ def code_of(error: ConfigError | DamagedStoreError) -> int:
 
 @contextlib.contextmanager
 def fail_on_our_errors() -> Iterator[None]:
-    """Turns our errors into one line, their notes, and an exit code: 2 for wrong options and files, 1 for all
-    others."""
+    """Turns our errors into a line, notes, and an exit code: 2 for wrong options and files, else 1."""
     try:
         yield
     except (ConfigError, DamagedStoreError) as error:
@@ -151,10 +146,7 @@ def fail_on_our_errors() -> Iterator[None]:
     except UnicodeEncodeError as error:
         if not any(str(error.object) in word for word in sys.argv):
             raise
-        fail(
-            f"{harmless(str(error.object))!r} is not UTF-8, which names and messages are: choose another",
-            USAGE_ERROR,
-        )
+        fail(f"{harmless(str(error.object))!r} is not UTF-8, which names and messages are: choose another")
     except KeyboardInterrupt:
         fail("interrupted", 130)
 
@@ -170,10 +162,7 @@ def run_to_end(work: Coroutine[Any, Any, T]) -> T:
 
 
 def end_on_sigterm() -> None:
-    """Makes SIGTERM cancel the calling task, so that the command ends in order, as with Ctrl-C.
-
-    Not so SIGHUP: after a lost terminal a run can be resumed, as after a kill.
-    """
+    """SIGTERM cancels the calling task, as Ctrl-C does; SIGHUP does not, as the run can be resumed."""
     import asyncio
 
     main = asyncio.current_task()

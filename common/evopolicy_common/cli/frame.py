@@ -29,8 +29,7 @@ _WRONG = {
     "greater_than_equal": "is less than {ge}",
     "less_than_equal": "is more than {le}",
 }
-"""What typer's library finds wrong with an option's value, by its name of the error; its own texts do not tell the
-value."""
+"""Faults of an option's value by the name that typer's library gives them; its texts lack the value."""
 _MOST_CHARACTERS = 32_768
 """Of an option's value: no list of cases and no agent's command is longer."""
 SEVERAL_LINES = frozenset({"agent"})
@@ -71,7 +70,7 @@ class _Help:
             usual = "Options" if param.param_type_name == "option" else "Arguments"
             name = getattr(param, "rich_help_panel", None) or usual
             # `--runs <path>` as `--runs PATH`, `--env <list[str]>` as `--env TEXT`; choices stay unchanged.
-            shown = _VALUE.sub(lambda found: _METAVARS.get(found[1].lower(), found[0]), record[0])
+            shown = _VALUE.sub(lambda match: _METAVARS.get(match[1].lower(), match[0]), record[0])
             groups.setdefault(name, []).append((shown, record[1]))
         if "Options" in groups:  # last: grouped options are more specific
             others = groups.pop("Options")
@@ -154,8 +153,7 @@ class App(typer.Typer):
 
 
 def run_app(app: typer.Typer, extra: str | None = None) -> NoReturn:
-    """Runs the command that `sys.argv` names, and exits. `extra`: the extra that it needs; None: that of a missing
-    module."""
+    """Runs the command that `sys.argv` names, and exits. `extra`: the one it needs; None: by module."""
     open_streams()
     end_without_reader()
     try:
@@ -172,10 +170,8 @@ def run_app(app: typer.Typer, extra: str | None = None) -> NoReturn:
 
 @contextlib.contextmanager
 def needed_extras(needed: str | None = None) -> Iterator[None]:
-    """Ends the command, and names the extra to install, when the body misses a module of an extra.
-
-    `needed`: the extra to name; None for that of the module. Version and help are answered as far as possible.
-    """
+    """Ends the command when the body misses a module, and names the extra to install: `needed`, or the
+    module's. Version and help are answered as far as possible."""
     try:
         yield
     except ModuleNotFoundError as error:
@@ -204,9 +200,11 @@ def _unusable(value: str, *, several_lines: bool) -> str:
 
 
 def _usage_text(error: Any) -> str:
-    found: list[Any] = getattr(error.__cause__, "errors", list)()
-    if found and found[0]["type"] in _WRONG:
-        error.message = f"{found[0]['input']!r} {_WRONG[found[0]['type']].format(**found[0].get('ctx', {}))}"
+    errors: list[Any] = getattr(error.__cause__, "errors", list)()
+    if errors and errors[0]["type"] in _WRONG:
+        error.message = (
+            f"{errors[0]['input']!r} {_WRONG[errors[0]['type']].format(**errors[0].get('ctx', {}))}"
+        )
     text = " ".join(str(error.format_message()).split()).replace("Value error, ", "") or "wrong usage"
     context = getattr(error, "ctx", None)
     return text if context is None else f"{text.rstrip('.')}; see {context.command_path} --help"

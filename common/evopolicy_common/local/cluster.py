@@ -29,8 +29,8 @@ from evopolicy_common.processes.scratch import scratch_folder
 from evopolicy_common.records.blobs import write_atomically
 from evopolicy_common.records.open_run import is_held
 from evopolicy_common.wire import credentials, transport
+from evopolicy_common.wire.credentials import Ready, read_ready
 from evopolicy_common.wire.operator_client import OperatorClient
-from evopolicy_common.wire.ready import Ready, read_ready
 
 START_TIMEOUT_S = 60.0
 END_GRACE_S = 10.0
@@ -98,9 +98,8 @@ async def _start_workers(
     processes: _Processes, audited: bool, options: Sequence[str], credentials: Sequence[str], wanted: Workers
 ) -> None:
     notify_of_many_slots(wanted.slots)
-    divided = installs.divided(wanted.env_ids)
     suffixes = ("", "-2") if audited else ("",)
-    for python, env_ids in divided.items():
+    for python, env_ids in installs.divided(wanted.env_ids).items():
         # --unsandboxed: whoever starts this cluster also chooses the tiers of its runs.
         program = [*_module("evopolicy_worker.cli", python), "--grace", "1", "--unsandboxed", *credentials]
         program += [*options, *_options([("--env", catalogue.source_of(env_id)) for env_id in env_ids])]
@@ -198,10 +197,7 @@ async def local_cluster(
 
 
 async def _end_permits_of_killed(kept: Path, operator_file: Path) -> None:
-    """Ends the permits of agents whose commands were killed, so that no later run waits for them.
-
-    The kernel ends a jailed agent with its agent supervisor, and the supervisor with its command.
-    """
+    """Ends the permits of agents whose commands were killed: the kernel has ended these agents."""
     watched = {path.name: path.read_text().splitlines() for path in kept.iterdir()}
     gone = [run for run, locks in watched.items() if not any(is_held(Path(lock)) for lock in locks)]
     if not gone:
@@ -242,9 +238,7 @@ class _Processes:
     def __init__(self, logs: Path, kind: str, lock_fd: int) -> None:
         """`lock_fd`: stays open in all of them, so that its lock outlives this process if they do."""
         self.failed: asyncio.Future[None] = asyncio.get_running_loop().create_future()
-        self._lock_fd = lock_fd
-        self._logs = logs
-        self._kind = kind
+        self._logs, self._kind, self._lock_fd = logs, kind, lock_fd
         self._running: list[ChildProcess] = []
         self._restarting: list[asyncio.Task[None]] = []
 

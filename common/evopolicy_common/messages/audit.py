@@ -1,4 +1,4 @@
-"""Results of a run's audits: reported to operators and kept in `run.json`, never sent to a gateway.
+"""A run's audits and its entries in the journal: reported to operators and kept in `run.json`, never sent to a gateway.
 
 An audit replays an episode's recorded actions on another worker and compares the two records bit for bit.
 """
@@ -58,3 +58,20 @@ class AuditRecord(msgspec.Struct, frozen=True, kw_only=True):
     def in_question(self) -> bool:
         """Whether the run's numbers may be forged: a result is disputed, or a forger played some of its episodes."""
         return self.disputed > 0 or any(self.forgers.values())
+
+
+class Committed(msgspec.Struct, frozen=True, kw_only=True):
+    """The coordinator's commitment before the run's agent started, with its journal entries. See `records.journal`."""
+
+    commitment: Word
+    """Salted SHA-256 (hex) of the run's splits and settings."""
+    epoch: Word
+    """The epoch of the run's cases: all runs of an epoch derive theirs from one secret."""
+    opened: Int
+    """Index of the journal entry that holds the commitment, from 0."""
+    opened_head: Word
+    """Hash (hex) of the journal up to that entry."""
+    ended: Int | None = None
+    """Index of the entry that holds the digest of the run's result; None until the run is finished."""
+    ended_head: Word = ""
+    """Hash (hex) of the journal up to that entry."""

@@ -37,9 +37,8 @@ Plain = Annotated[dict[str, Any], Meta(max_length=1 << 16, extra={"plain": True}
 """Data of JSON's kinds; `check_plain` checks and bounds its content."""
 
 
-def check_plausible(record: object) -> None:
-    """Raises ValueError naming the field of a decoded record with a number beyond `LARGEST`, which JSON allows: sums,
-    texts and conversions of such numbers fail."""
+def check_plausible(record: T) -> T:
+    """Returns the record. Raises ValueError for a field with a number beyond `LARGEST`, which JSON allows."""
     queue: list[tuple[str, Any]] = [("", to_builtins(record))]
     while queue:
         name, value = queue.pop()
@@ -49,6 +48,7 @@ def check_plausible(record: object) -> None:
             queue += [(name, inner) for inner in value]
         elif isinstance(value, int | float) and not -LARGEST <= value <= LARGEST:
             raise ValueError(f"{name}: a number beyond {LARGEST:g} is not plausible in a run")
+    return record
 
 
 def plain_parts(message: Struct) -> Iterator[object]:
@@ -67,10 +67,10 @@ def plain_parts(message: Struct) -> Iterator[object]:
 @cache
 def _fields(kind: type) -> tuple[tuple[str, bool], ...]:
     """The fields of a struct that are `Plain` (True), or structs or tuples of structs with such fields (False)."""
-    found = inspect.type_info(kind)
-    assert isinstance(found, inspect.StructType)
+    info = inspect.type_info(kind)
+    assert isinstance(info, inspect.StructType)
     fields = []
-    for field in found.fields:
+    for field in info.fields:
         kinds = list(_alternatives(field.type))
         if any(isinstance(each, inspect.Metadata) and (each.extra or {}).get("plain") for each in kinds):
             fields.append((field.name, True))
@@ -79,17 +79,17 @@ def _fields(kind: type) -> tuple[tuple[str, bool], ...]:
     return tuple(fields)
 
 
-def _alternatives(found: inspect.Type) -> Iterator[inspect.Type]:
+def _alternatives(kind: inspect.Type) -> Iterator[inspect.Type]:
     """The types that a field may have, and for a tuple also those of its items."""
-    if isinstance(found, inspect.UnionType):
-        for each in found.types:
+    if isinstance(kind, inspect.UnionType):
+        for each in kind.types:
             yield from _alternatives(each)
-    elif isinstance(found, inspect.VarTupleType):
-        yield from _alternatives(found.item_type)
+    elif isinstance(kind, inspect.VarTupleType):
+        yield from _alternatives(kind.item_type)
     else:
-        yield found
-        if isinstance(found, inspect.Metadata):
-            yield from _alternatives(found.type)
+        yield kind
+        if isinstance(kind, inspect.Metadata):
+            yield from _alternatives(kind.type)
 
 
 def check_plain(value: object) -> None:

@@ -48,8 +48,7 @@ class EnvironmentDescription(msgspec.Struct, frozen=True, kw_only=True):
     obs_space: SpaceSchema
     action_space: SpaceSchema
     obs_storage: ObsStorage = "inline"
-    """Storage of observations in feedback: in the rows of the trajectory, or in `observations.npy` / `.npz` beside
-    it."""
+    """Where feedback keeps observations: in the rows, or in `observations.npy` / `.npz` beside them."""
     max_episode_steps: Int
     reward_components: Many[Text] = ()
     """Names under which `info`, or its `rewards`, reports parts of the reward; summed per episode in the summary."""
@@ -74,8 +73,7 @@ class EnvironmentDescription(msgspec.Struct, frozen=True, kw_only=True):
     success_at: Literal["end", "any"] = "end"
     """Whether only the last step's value counts, or a true value at any step."""
     adapter: Word = ""
-    """Revision of the adapter, `+`, and a digest of the adapter's code. Empty from workers of older versions, whose
-    fingerprint is that of the whole worker."""
+    """Revision of the adapter, `+`, and a digest of its code; empty from workers of older versions."""
     packages: Named[Text] = {}
     """Name to exact version of the distributions that decide this environment's numbers."""
     step_us: Number = 0.0
@@ -93,11 +91,8 @@ class EnvironmentDescription(msgspec.Struct, frozen=True, kw_only=True):
         )
 
     def digest(self) -> str:
-        """SHA-256 of the definition, 64 hex digits: of all fields except the adapter, versions, the time of a
-        step, and where observations are kept.
-
-        A field at its default does not count, so that fields added later change no digest.
-        """
+        """SHA-256 of the definition, 64 hex digits: of all fields except `_NOT_DEFINED`. A field at its
+        default does not count, so that fields added later change no digest."""
         fields = {
             field.name: value
             for field in msgspec.structs.fields(self)

@@ -127,8 +127,7 @@ class Job(msgspec.Struct, frozen=True, kw_only=True):
     observations: ObservationForm = "arrays"
     record: Record = "full"
     render: bool = False
-    """With record "full": report finished feedback files (`records.episodes.rendered`), which the receiver only
-    unpacks."""
+    """With record "full": report finished feedback files (`records.episodes.rendered`)."""
     video: bool = False
     """Also record a video of each episode (one rendered frame per row)."""
     video_episodes: Int = 0

@@ -36,9 +36,8 @@ SubmitStatus = Literal[
     "quarantined",
     "cancelled",
 ]
-"""All verdicts are charged, except `cancelled` and the first two (`RejectedStatus`). `cancelled`: the operator ended
-the run in the meantime.
-`quarantined`: only of submits that a coordinator of an earlier version ended."""
+"""All verdicts are charged, except `cancelled` (the operator ended the run) and the first two
+(`RejectedStatus`). `quarantined`: only of submits that a coordinator of an earlier version ended."""
 
 CANCELLED = "cancelled"
 """The `close_reason` of a run that its operator cancelled."""
@@ -48,8 +47,8 @@ SimulationRule = Literal["forbidden", "allowed"]
 FinishRule = Literal["early", "budget"]
 """Whether a run whose agent stops before it has spent its budget is scored (`early`) or is an error (`budget`)."""
 FeedbackDetail = Literal["scores", "trajectories", "pictures"]
-"""Feedback level: `scores` is the summary alone, `trajectories` adds text, and `pictures` adds observations that are
-stored outside the rows, and recorded videos."""
+"""`scores`: the summary alone; `trajectories`: text too; `pictures`: also files of observations and
+videos."""
 Profile = Literal["own", "published", "published-data"]
 """All choices of the published protocol together (`run_settings.off_profile`): `published` with the number of hidden
 cases in the paper, `published-data` with that of the published case files."""
@@ -69,15 +68,12 @@ class OpenRun(FromGateway, frozen=True, kw_only=True, tag="open_run"):
     asks_permit: bool = False
     """The gateway sends `RequestPermit` before its agent starts. Otherwise the agent may already be on any machine."""
     reads_rendered: bool = False
-    """The gateway reads episodes rendered by workers (`records.episodes.rendered`); gateways of earlier versions do
-    not."""
+    """The gateway reads episodes rendered by workers; gateways of earlier versions do not."""
 
 
 class RequestPermit(FromGateway, frozen=True, kw_only=True, tag="request_permit"):
-    """Requests a permit for the run's agent to be alive on a kernel: a long poll, safe to send again.
-
-    The permit lasts until the run is closed or cancelled, or an operator vouches that the agent has ended.
-    """
+    """Requests a permit for the run's agent to be alive on a kernel: a long poll, safe to send again. It
+    lasts until the run is closed or cancelled, or an operator vouches that the agent has ended."""
 
     boot_id: Word
     """Boot id of the agent's kernel (`host.boot_id`); empty: unknown, which counts as every kernel."""
@@ -179,8 +175,7 @@ class Submit(FromGateway, frozen=True, kw_only=True, tag="submit"):
     bundle_error: PolicyFailure | None = None
     """Why there is no bundle: becomes the verdict, charged as `protocol.md` describes for a bundle without a Policy."""
     rejected: RejectedStatus | None = None
-    """In the published profiles: the request takes an index, plays nothing, and has this verdict. It has no cases,
-    bundle or `bundle_error` then."""
+    """In the published profiles: the request takes an index, plays nothing, and has this verdict."""
     tree: Word = ""
     """Digest of the recorded workspace, from which other runs may start; empty: not recorded."""
 
@@ -256,8 +251,7 @@ class CloseRun(FromGateway, frozen=True, kw_only=True, tag="close_run"):
     """No more submits will follow. Sent after the agent and all its children have ended; finalisation waits for it."""
 
     reason: Text
-    """`budget_spent`, `agent_stopped`, `agent_failed`, `silent`, `wall_limit`, `model_budget_spent`,
-    `disk_limit`, `cancelled`."""
+    """As `closed_reason` of `run.json` lists them."""
     agent: Plain = {}
     """The gateway's facts about the agent for `run.json`: turns, retries, tokens, version."""
 

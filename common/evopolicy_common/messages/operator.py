@@ -6,7 +6,7 @@ from typing import Literal
 
 import msgspec
 
-from evopolicy_common.messages.audit import AuditRecord
+from evopolicy_common.messages.audit import AuditRecord, Committed
 from evopolicy_common.messages.bounds import Bytes, Int, Many, Named, Number, Numbered, Plain, Text, Word
 from evopolicy_common.messages.environment import (
     Case,
@@ -20,7 +20,6 @@ from evopolicy_common.messages.environment import (
 )
 from evopolicy_common.messages.episode import BlobRef, EpisodeOutcome, Record, ResourceLimits, Tier
 from evopolicy_common.messages.gateway import SubmitStatus
-from evopolicy_common.messages.journal import Committed
 from evopolicy_common.messages.run_settings import HiddenIsolation, RunSettings
 from evopolicy_common.messages.status import FromOperator, StatusReply, StatusRequest
 from evopolicy_common.messages.worker import (
@@ -327,8 +326,7 @@ class Done(Message, frozen=True, kw_only=True, tag="ok"):
 
 
 class Claim(FromOperator, frozen=True, kw_only=True, tag="claim"):
-    """One run of a sweep, for this host to play: taken, renewed, released or settled, so that no run is played
-    twice."""
+    """One run of a sweep: taken, renewed, released or settled, so that no two hosts play it."""
 
     suite: Word
     """The sweep's name."""
@@ -348,8 +346,7 @@ class ClaimState(Message, frozen=True, kw_only=True, tag="claim_state"):
     """The state of a claim after a `Claim`."""
 
     granted: bool
-    """True when the requester holds the claim or has just settled it. False: another host holds it, it was settled
-    before, or this request released it."""
+    """Whether the requester holds the claim or has just settled it."""
     holder: Word
     """The present or last holder; empty for none."""
     run: Word
@@ -445,45 +442,13 @@ class ApproveEnvironment(FromOperator, frozen=True, kw_only=True, tag="approve_e
     digest: Word
 
 
-OperatorRequest = (
-    CreateRun
-    | WaitRun
-    | Evaluate
-    | EvaluationPoll
-    | FurtherCasesRequest
-    | Rescore
-    | DescribeEnvironment
-    | RecordedRequest
-    | CancelRun
-    | AgentGone
-    | RepinRun
-    | SetWorker
-    | Claim
-    | Disclose
-    | JournalRequest
-    | OpeningRequest
-    | SignRequest
-    | StatusRequest
-    | EnvironmentsRequest
-    | ApproveEnvironment
-    | BlobPut
-    | BlobGet
+_OfRuns = CreateRun | WaitRun | CancelRun | AgentGone | RepinRun | Claim | Disclose | OpeningRequest | Rescore
+_OfEpisodes = Evaluate | EvaluationPoll | RecordedRequest | FurtherCasesRequest | BlobPut | BlobGet
+_OfEnvironments = DescribeEnvironment | EnvironmentsRequest | ApproveEnvironment
+_OfCluster = StatusRequest | SetWorker | JournalRequest | SignRequest
+OperatorRequest = _OfRuns | _OfEpisodes | _OfEnvironments | _OfCluster
+_OnRuns = (
+    RunCreated | RunProgress | ClaimState | RunOpening | EvaluationStarted | EvaluationPage | FurtherCases
 )
-OperatorReply = (
-    RunCreated
-    | RunProgress
-    | EvaluationStarted
-    | EvaluationPage
-    | FurtherCases
-    | EnvironmentState
-    | Done
-    | ClaimState
-    | JournalPage
-    | RunOpening
-    | Signed
-    | StatusReply
-    | EnvironmentsReply
-    | BlobAck
-    | BlobChunk
-    | Refused
-)
+_OnCluster = EnvironmentState | EnvironmentsReply | StatusReply | JournalPage | Signed | Done
+OperatorReply = _OnRuns | _OnCluster | BlobAck | BlobChunk | Refused

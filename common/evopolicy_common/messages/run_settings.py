@@ -20,9 +20,8 @@ from evopolicy_common.messages.episode import ResourceLimits, Tier
 from evopolicy_common.messages.gateway import FeedbackDetail, FinishRule, Profile, SimulationRule, VideoOption
 
 HiddenIsolation = Literal["exclusive", "shared", "waived", "unknown"]
-"""Whether hidden episodes and agents could share a kernel. exclusive: never. shared: possible, as the rule was off
-for all or part of the run. waived: the operator vouched for where the agent was. unknown: the run was played before
-this was recorded."""
+"""Whether hidden episodes and agents could share a kernel. exclusive: never. shared: possible. waived: the
+operator vouched for where the agent was. unknown: from before this was recorded."""
 
 HiddenCases = Literal["shared", "per_run"]
 """Validation and held-out cases: the same for all runs of an environment, or each run's own (no paired statistics)."""
@@ -44,8 +43,7 @@ class Start(msgspec.Struct, frozen=True, kw_only=True):
     tree: Word
     """SHA-256, hex, of the recorded workspace, as that run's gateway named it with the submit."""
     parent_scored: bool = False
-    """Set by the coordinator: the agent of that run, or of one that it started from, had ended, so that a result may
-    have chosen the place."""
+    """Set by the coordinator: the earlier agent had ended, so that a result may have chosen the place."""
 
 
 class RunSettings(msgspec.Struct, frozen=True, kw_only=True):
@@ -135,15 +133,11 @@ def off_profile(settings: RunSettings) -> str:
 
 
 def episode_counts(settings: RunSettings, suite: Suite) -> tuple[int, int, int]:
-    """Budget, least and greatest number of episodes of a submit of a run. Raises ConfigError for numbers that no run
-    can have."""
+    """Budget, least and most episodes of a submit. Raises ConfigError for impossible numbers."""
 
-    def given(number: int | None, usual: int) -> int:
-        return usual if number is None else number
-
-    budget = given(settings.budget, suite.budget)
-    least = given(settings.min_episodes_per_submit, suite.min_episodes_per_submit)
-    wanted = given(settings.max_episodes_per_submit, suite.max_episodes_per_submit)
+    names = ("budget", "min_episodes_per_submit", "max_episodes_per_submit")
+    given = {name: getattr(settings, name) for name in names}
+    budget, least, wanted = (getattr(suite, name) if given[name] is None else given[name] for name in names)
     most = min(wanted, budget)
     if not 1 <= least <= most:
         raise ConfigError(

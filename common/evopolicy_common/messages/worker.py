@@ -1,5 +1,4 @@
-"""Messages between workers and the coordinator. Workers send requests and the coordinator replies; never the
-reverse."""
+"""Messages between workers, which send requests, and the coordinator, which replies."""
 
 from __future__ import annotations
 
@@ -30,8 +29,7 @@ class Refused(Message, frozen=True, kw_only=True, tag="refused"):
 
 
 class Fingerprint(msgspec.Struct, frozen=True, kw_only=True):
-    """Everything besides the seed that determines numerical results: of the whole worker, or of one environment (see
-    `of`)."""
+    """Everything besides the seed that decides results, of a worker or of one environment (`of`)."""
 
     code_version: Word
     """Version and source digest of the worker's own code."""
@@ -57,11 +55,8 @@ class Fingerprint(msgspec.Struct, frozen=True, kw_only=True):
         )
 
     def class_name(self, *, cpu: bool) -> str:
-        """12 hex digits, equal for workers whose results may stand in one run. With `cpu`, the CPU's features count
-        too.
-
-        A change in the worker's code changes an environment's class only if it is in the adapter's code.
-        """
+        """12 hex digits, equal for workers whose results may stand in one run; with `cpu`, by the CPU's
+        features too. The worker's code changes an environment's class only if it is in the adapter's."""
         code = [self.adapter, self.definition] if self.adapter else [self.code_version]
         parts = [*code, self.python, sorted(self.packages.items())]
         if cpu:
@@ -79,8 +74,7 @@ class Fingerprint(msgspec.Struct, frozen=True, kw_only=True):
 
 
 REASON_CHARACTERS = {"tier": 500, "environment": 2000, "environments": 60_000, "result": 2000}
-"""Most characters of a worker's reasons: why a tier does not work, why an environment failed, why all of these failed,
-and why a job did."""
+"""Most characters of a worker's reasons: of a tier, of an environment, of all environments, of a job."""
 
 
 class Register(Message, frozen=True, kw_only=True, tag="register"):
@@ -136,8 +130,7 @@ class LeaseRequest(Message, frozen=True, kw_only=True, tag="lease"):
     warm_bundles: Many[Text] = ()
     warm_environments: Many[Text] = ()
     serial: Int = 0
-    """The worker's own number of this poll; increases, also across restarts. 0: the worker does not number its
-    polls."""
+    """The worker's number of this poll; increases, also across restarts. 0: it does not number its polls."""
 
 
 class Lease(msgspec.Struct, frozen=True, kw_only=True):
@@ -183,8 +176,7 @@ class Heartbeat(Message, frozen=True, kw_only=True, tag="beat"):
     wait_s: Number = 0.0
     """The reply may be held back for this long; it comes at once when there is a lease to stop."""
     settled: Int = 0
-    """All polls up to this number had ended when `held` was written: their leases are in it or were released. 0: the
-    worker does not number its polls."""
+    """All polls up to this one had ended when `held` was written. 0: no polls are numbered."""
 
 
 class HeartbeatReply(Message, frozen=True, kw_only=True, tag="beat_reply"):
@@ -199,9 +191,8 @@ class HeartbeatReply(Message, frozen=True, kw_only=True, tag="beat_reply"):
 
 
 ResultKind = Literal["done", "returned", "slot_died", "failed"]
-"""done: played. returned: given back unfinished (drained, preempted, cancelled). failed: infrastructure (ended from
-outside, environment crashed by itself, disk full, sandbox). slot_died: only from workers of earlier versions; the
-same as failed."""
+"""done: played. returned: given back unfinished (drained, preempted, cancelled). failed: infrastructure.
+slot_died: only from workers of earlier versions; the same as failed."""
 
 
 class JobResult(msgspec.Struct, frozen=True, kw_only=True):
@@ -218,8 +209,7 @@ class JobResult(msgspec.Struct, frozen=True, kw_only=True):
     error: Text = ""
     """For operators; never shown to an agent."""
     begun: BlobRef | None = None
-    """Of an unfinished hidden job: the actions that its policy has returned and its failures, for `Job.begun` of the
-    next attempt. Only workers read these bytes."""
+    """Of an unfinished hidden job, for `Job.begun`: actions and failures. Only workers read it."""
     limit_verdict: bool = False
     """Whether `begun` contains a failure by a limit."""
     environment_fault: bool = False

@@ -65,20 +65,19 @@ class Group:
     """A group of processes, in every hierarchy that this process may use. Empty where it may use none."""
 
     def __init__(self, limits: Mapping[str, int]) -> None:
-        """`limits` by controller: `cpu` in microseconds of processor time in 0.1 s, `memory` in bytes,
-        `pids` in tasks."""
+        """By controller: `cpu` (µs of processor time in 0.1 s), `memory` (bytes), `pids` (tasks)."""
         self.held: dict[str, int] = {}
         """Version of the cgroup that counts, and limits where a limit was given, by controller."""
         self._folders: dict[str, Path] = {}
         made: dict[Path, Path] = {}
-        for controller, found in hierarchies().items():
+        for controller, hierarchy in hierarchies().items():
             with contextlib.suppress(OSError):
-                folder = made.get(found.folder) or _made(found.folder)
-                made[found.folder] = folder
+                folder = made.get(hierarchy.folder) or _made(hierarchy.folder)
+                made[hierarchy.folder] = folder
                 if controller in limits:
-                    _limit(folder, _FILES[controller, found.version], limits[controller])
+                    _limit(folder, _FILES[controller, hierarchy.version], limits[controller])
                 if controller in CONTROLLERS:
-                    self.held[controller] = found.version
+                    self.held[controller] = hierarchy.version
                 self._folders[controller] = folder
         self._made = tuple(made.values())
 
@@ -100,8 +99,7 @@ class Group:
         return first if first is not None else self._number("memory", "memory.peak")
 
     def hits(self, controller: str) -> int:
-        """How often the limit was reached: processes that the kernel ended for memory, forks that it
-        refused."""
+        """How often the limit was reached: processes ended for memory, or forks refused."""
         if controller not in self.held:
             return 0
         return self._number(controller, *_FILES[controller, self.held[controller]].hits) or 0
@@ -124,10 +122,8 @@ class Group:
 
 
 def hierarchies(own: str | None = None, root: Path = ROOT) -> dict[str, Hierarchy]:
-    """Where this process may make groups, by controller, and `cpuacct` of version 1.
-
-    `own`: the content of /proc/self/cgroup. Version 2 gets its controllers enabled for groups below."""
-    found: dict[str, Hierarchy] = {}
+    """Where this process may make groups, by controller. `own`: the content of /proc/self/cgroup."""
+    usable: dict[str, Hierarchy] = {}
     second: Path | None = None
     try:
         lines = (Path("/proc/self/cgroup").read_text() if own is None else own).splitlines()
@@ -143,11 +139,11 @@ def hierarchies(own: str | None = None, root: Path = ROOT) -> dict[str, Hierarch
         folder = next((each for each in (base / path.lstrip("/"), base) if _is_ours(each)), None)
         if folder is not None:
             wanted = {*CONTROLLERS, "cpuacct"} & {*names.split(",")}
-            found |= dict.fromkeys(sorted(wanted), Hierarchy(folder, 1))
+            usable |= dict.fromkeys(sorted(wanted), Hierarchy(folder, 1))
     if second is not None:
-        for controller in _enabled(second, {*CONTROLLERS} - found.keys()):
-            found[controller] = Hierarchy(second, 2)
-    return found
+        for controller in _enabled(second, {*CONTROLLERS} - usable.keys()):
+            usable[controller] = Hierarchy(second, 2)
+    return usable
 
 
 def _own_of_version_2(root: Path, path: str) -> Path | None:

@@ -36,16 +36,14 @@ class ChildProcess:
     """A running child. Start it on the main thread: its parent-death signal comes when that thread ends."""
 
     def __init__(self, process: asyncio.subprocess.Process, log: Path, log_start: int) -> None:
-        self._process = process
-        self.log = log
-        self._log_start = log_start
+        self._process, self.log, self._log_start = process, log, log_start
 
     @classmethod
     async def start(
         cls, program: Sequence[str], log: Path, *, talks: bool = False, keeps: Sequence[int] = ()
     ) -> Self:
-        """Starts `program` with stderr appended to `log`. `talks`: its stdin and stdout are pipes to this process.
-        `keeps`: file descriptors that stay open in it."""
+        """Starts `program` with stderr appended to `log`. `talks`: its stdin and stdout are pipes to this
+        process. `keeps`: file descriptors that stay open in it."""
         log.parent.mkdir(parents=True, exist_ok=True)
         pipe = asyncio.subprocess.PIPE if talks else asyncio.subprocess.DEVNULL
         with log.open("ab") as out:
@@ -60,9 +58,7 @@ class ChildProcess:
                     start_new_session=True,
                     limit=_LINE_LIMIT,
                     env={
-                        name: value
-                        for name, value in os.environ.items()
-                        if not name.startswith("EVOPOLICYGYM_")
+                        name: os.environ[name] for name in os.environ if not name.startswith("EVOPOLICYGYM_")
                     },
                 )
                 live.add(process.pid)
@@ -78,8 +74,7 @@ class ChildProcess:
         return self._process.returncode
 
     def last_words(self) -> str:
-        """Its error, or else the last line of its log. A process of another command may have written after it, where
-        both use one state folder."""
+        """Its error, or else the log's last line, perhaps of another command's process."""
         return last_words(self.log, since=self._log_start)
 
     async def ended(self) -> int:
@@ -105,8 +100,7 @@ class ChildProcess:
 
 
 def last_words(log: Path, since: int | None = None) -> str:
-    """The last line of a log, to explain why its process ended; empty if there is none. With `since`, an offset: the
-    last error from there on, if there is one."""
+    """The last line of a log, or empty. With `since`, an offset: the last error after it, if any."""
     try:
         with log.open("rb") as file:
             file.seek(max(since or 0, log.stat().st_size - 4096))

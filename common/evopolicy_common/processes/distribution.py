@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import platform
 from pathlib import Path
 
@@ -38,8 +39,7 @@ _SETTINGS = (
         " `userns,`",
     ),
 )
-"""Files below `/proc/sys`, the value that forbids user namespaces, and the remedy. Without a file in
-`/etc/sysctl.d`, it lasts until the next reboot."""
+"""Files below `/proc/sys`, the value that forbids user namespaces, and the remedy until the next reboot."""
 _CONTAINER_MARKS = ("/.dockerenv", "/run/.containerenv")
 
 
@@ -49,21 +49,20 @@ def install(what: str) -> str:
         release = platform.freedesktop_os_release()
     except OSError:
         release = {}
+    commands = {family: f"{call} {_PACKAGES[what].get(family, what)}" for family, call in _INSTALL.items()}
     for name in (release.get("ID", ""), *release.get("ID_LIKE", "").split()):
         family = name.partition("-")[0]
-        family = _KIN.get(family, family)
-        if family in _INSTALL:
-            return _command(family, what)
-    return f"{_command('debian', what)} (Debian, Ubuntu), {_command('fedora', what)} (Fedora)"
-
-
-def _command(family: str, what: str) -> str:
-    return f"{_INSTALL[family]} {_PACKAGES[what].get(family, what)}"
+        if command := commands.get(_KIN.get(family, family)):
+            return command
+    return f"{commands['debian']} (Debian, Ubuntu), {commands['fedora']} (Fedora)"
 
 
 def permit_namespaces(settings: Path = Path("/proc/sys")) -> str:
     """How to permit user namespaces: the settings that forbid them now, or else all settings that could."""
-    remedies = [remedy for name, forbids, remedy in _SETTINGS if _value(settings / name) == forbids]
+    remedies = []
+    for name, forbids, remedy in _SETTINGS:
+        with contextlib.suppress(OSError):
+            remedies += [remedy] if (settings / name).read_text().strip() == forbids else []
     if remedies:
         return "; ".join(remedies)
     if any(Path(mark).exists() for mark in _CONTAINER_MARKS):
@@ -72,10 +71,3 @@ def permit_namespaces(settings: Path = Path("/proc/sys")) -> str:
     return (
         f"none of {names} forbids them here: in a container, start it with --security-opt seccomp=unconfined"
     )
-
-
-def _value(path: Path) -> str:
-    try:
-        return path.read_text().strip()
-    except OSError:
-        return ""

@@ -6,6 +6,7 @@ enter folders nested deeper than `MAX_DEPTH`, or beyond the system's longest pat
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import os
 import stat
@@ -19,16 +20,15 @@ _ENTER = os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC
 
 
 def left_files(root: Path, enter: Callable[[str], bool] = lambda name: True) -> Iterator[tuple[Path, int]]:
-    """Yields regular files below `root` with their sizes (bytes): first a folder's own, then those of its folders, by
-    name.
-
-    `enter` decides by its name whether a folder is entered. Unreadable entries are skipped.
-    """
+    """Yields regular files below `root` with their sizes (bytes), a folder's own first, by name. `enter`
+    decides by its name whether a folder is entered. Skips unreadable entries."""
     waiting = [(str(root), 0)]
     while waiting:
         folder, depth = waiting.pop()
-        names = _names(folder)
         folders = []
+        names: list[str] = []
+        with contextlib.suppress(OSError):
+            names = sorted(os.listdir(folder))
         for name in names:
             path = os.path.join(folder, name)
             try:
@@ -40,13 +40,6 @@ def left_files(root: Path, enter: Callable[[str], bool] = lambda name: True) -> 
             elif stat.S_ISDIR(info.st_mode) and depth < MAX_DEPTH and enter(name):
                 folders.append((path, depth + 1))
         waiting += reversed(folders)
-
-
-def _names(folder: str) -> list[str]:
-    try:
-        return sorted(os.listdir(folder))
-    except OSError:
-        return []
 
 
 def keep_to_owner(root: Path) -> int:
@@ -80,9 +73,8 @@ def keep_to_owner(root: Path) -> int:
             else:
                 waiting.pop()
                 inner = os.open("..", _ENTER, dir_fd=at)
-                if not os.path.samestat(
-                    os.fstat(inner), waiting[-1][0]
-                ):  # moved by a program that is still alive
+                # Another folder: a program that is still alive has moved this one.
+                if not os.path.samestat(os.fstat(inner), waiting[-1][0]):
                     os.close(inner)
                     return refused + 1
             os.close(at)

@@ -40,8 +40,7 @@ class Waiting:
     """Filters repeated reports of what something waits for: new reasons are shown once, after a long enough wait."""
 
     def __init__(self) -> None:
-        self._since = asyncio.get_running_loop().time()
-        self._last = ""
+        self.ended()
 
     def ended(self) -> None:
         """The wait is over: the next one counts from now."""

@@ -39,7 +39,7 @@ def files_of(names: Iterable[str], *, metadata_too: bool = False) -> dict[str, s
     Raises ConfigError that names the package when it is not installed, or is or requires a simulator.
     """
     wanted = tuple(names)
-    found: dict[str, str] = {}
+    paths: dict[str, str] = {}
     distributions: set[str] = set()
     pending = [(name, name) for name in wanted]
     while pending:
@@ -47,22 +47,20 @@ def files_of(names: Iterable[str], *, metadata_too: bool = False) -> dict[str, s
         if name in distributions:
             continue
         distributions.add(name)
-        tops, needs = (
-            _numpy()
-            if name == "numpy"
-            else _one(name, requested, required=name in wanted, metadata_too=metadata_too)
-        )
-        found.update(tops)
+        if name == "numpy":
+            paths |= _numpy()
+            continue
+        tops, needs = _one(name, requested, required=name in wanted, metadata_too=metadata_too)
+        paths |= tops
         pending += [(need, requested) for need in needs]
-    return found
+    return paths
 
 
 def check_alone(names: Iterable[str]) -> None:
     """Raises ConfigError when other distributions have files in the folders of these: they would be shown with them."""
-    found, known = files_of(names), {_canonical(name) for name in versions_of(names)}
-    for top in found:
-        others = sorted(owner for owner in _owners().get(top, ()) if _canonical(owner) not in known)
-        if others:
+    tops, known = files_of(names), {_canonical(name) for name in versions_of(names)}
+    for top in tops:
+        if others := sorted(owner for owner in _owners().get(top, ()) if _canonical(owner) not in known):
             raise ConfigError(
                 f"the folder {top} belongs to {', '.join(others)} too, and cannot be shown alone"
             )
@@ -70,27 +68,25 @@ def check_alone(names: Iterable[str]) -> None:
 
 def versions_of(names: Iterable[str]) -> dict[str, str]:
     """Versions of the named distributions and of those that they require, by distribution. Raises as `files_of`."""
-    found: dict[str, str] = {}
+    versions: dict[str, str] = {}
     pending = list(names)
     while pending:
         distribution = _distribution(pending.pop())
-        if distribution is not None and distribution.metadata["Name"] not in found:
-            found[distribution.metadata["Name"]] = distribution.version
+        if distribution is not None and distribution.metadata["Name"] not in versions:
+            versions[distribution.metadata["Name"]] = distribution.version
             pending += _requires(distribution)
-    return dict(sorted(found.items()))
+    return dict(sorted(versions.items()))
 
 
 def policy_versions(names: Iterable[str]) -> dict[str, str]:
-    """The entries of a fingerprint for the packages that policies may import besides numpy: their names, and all
-    versions. Empty without packages. Raises as `files_of`."""
+    """Entries of a fingerprint for policies' packages besides numpy. Raises as `files_of`."""
     requested = sorted(set(names))
     if not requested:
         return {}
     files_of(requested)
-    found = {
-        f"{POLICY}:{name}": version for name, version in versions_of(requested).items() if name != "numpy"
-    }
-    return {POLICY: ",".join(requested), **found}
+    versions = {f"{POLICY}:{name}": version for name, version in versions_of(requested).items()}
+    versions.pop(f"{POLICY}:numpy", None)
+    return {POLICY: ",".join(requested), **versions}
 
 
 def packages_in(fingerprint: Mapping[str, str]) -> tuple[str, ...]:
@@ -100,27 +96,27 @@ def packages_in(fingerprint: Mapping[str, str]) -> tuple[str, ...]:
 
 def modules_of(names: Iterable[str]) -> list[str]:
     """Import names of the named distributions (or import names): scikit-learn is imported as `sklearn`."""
-    found: list[str] = []
+    modules: list[str] = []
     for name in names:
         if name.isidentifier() and importlib.util.find_spec(name) is not None:
-            found.append(name)
+            modules.append(name)
             continue
         tops, _ = _one(name, name, required=True, metadata_too=False)
-        found += [
+        modules += [
             top for top, path in tops.items() if top.isidentifier() and Path(path, "__init__.py").is_file()
         ]
-        found += [top.removesuffix(".py") for top in tops if top.endswith(".py")]
-    return found
+        modules += [top.removesuffix(".py") for top in tops if top.endswith(".py")]
+    return modules
 
 
-def _numpy() -> tuple[dict[str, str], list[str]]:
+def _numpy() -> dict[str, str]:
     # The usual case, without reading the metadata of a distribution.
     spec = importlib.util.find_spec("numpy")
     if spec is None or not spec.submodule_search_locations:
         raise ConfigError("numpy is not installed; install evopolicy again")
     folder = Path(next(iter(spec.submodule_search_locations)))
     both = [folder, folder.with_name("numpy.libs")]
-    return {path.name: str(path) for path in both if path.is_dir()}, []
+    return {path.name: str(path) for path in both if path.is_dir()}
 
 
 def _check_name(name: str) -> None:
@@ -180,14 +176,14 @@ def _requires(distribution: metadata.Distribution) -> list[str]:
 @functools.cache
 def _owners() -> dict[str, set[str]]:
     """Distributions by the top-level names of their files."""
-    found: dict[str, set[str]] = {}
+    owners: dict[str, set[str]] = {}
     for distribution in metadata.distributions():
         # The first part alone, as text: paths of all files would take seconds.
         lines = (distribution.read_text("RECORD") or "").splitlines()
         for top in {line.strip('"').partition(",")[0].partition("/")[0] for line in lines}:
             if top not in _NOT_IN_SITE and not top.endswith(_NO_CODE):
-                found.setdefault(top, set()).add(distribution.metadata["Name"])
-    return found
+                owners.setdefault(top, set()).add(distribution.metadata["Name"])
+    return owners
 
 
 def _canonical(name: str) -> str:

@@ -20,11 +20,8 @@ _PR_SET_PDEATHSIG = 1
 def ending_with_parent(
     program: Sequence[str], death_signal: signal.Signals = signal.SIGTERM, joins: Sequence[str] = ()
 ) -> list[str]:
-    """The command that starts `program` so that it ends with this process, in the cgroups of which `joins`
-    are the files.
-
-    The child must be started from this process's main thread: the signal is bound to the parent's thread.
-    """
+    """The command that starts `program` so that it ends with this process, in the cgroups of the files
+    `joins`. Start it from the main thread: the signal is bound to the parent's thread."""
     parent, number = str(os.getpid()), str(int(death_signal))
     return [sys.executable, "-I", "-S", __file__, parent, number, ":".join(joins), *program]
 
@@ -35,8 +32,7 @@ def end_with_parent(death_signal: signal.Signals) -> None:
 
 
 def main(arguments: list[str]) -> None:
-    """Executes the program; exit code 1 when the parent is gone already, or a cgroup; 127 when the program
-    cannot be started."""
+    """Executes the program. Exit code 1: the parent or a cgroup is gone; 127: it cannot be started."""
     parent, death_signal, program = int(arguments[0]), signal.Signals(int(arguments[1])), arguments[3:]
     end_with_parent(death_signal)
     for path in filter(None, arguments[2].split(":")):

@@ -46,23 +46,17 @@ _MAY_PASS = frozenset(
 
 
 def explained(error: OSError) -> str | None:
-    """The machine's fault with path and remedy, in one line; None for any other error, which may be a bug of this
-    software."""
-    if error.errno == errno.ENOENT and _folder_is_gone():
-        return "the folder in which this command was started is gone: change to another"
-    remedy = _REMEDIES.get(error.errno or 0)
-    if remedy is None:
+    """The machine's fault with path and remedy, in one line; None for any other error, which may be a bug."""
+    number = error.errno or 0
+    if number == errno.ENOENT:
+        try:
+            os.getcwd()
+        except FileNotFoundError:
+            return "the folder in which this command was started is gone: change to another"
+    if number not in _REMEDIES:
         return None
     where = os.fsdecode(error.filename) if isinstance(error.filename, str | bytes) else "a file"
-    return f"{where}: {os.strerror(error.errno or 0)}: {remedy}"
-
-
-def _folder_is_gone() -> bool:
-    try:
-        os.getcwd()
-    except FileNotFoundError:
-        return True
-    return False
+    return f"{where}: {os.strerror(number)}: {_REMEDIES[number]}"
 
 
 def foreseen(error: Exception) -> str | None:
@@ -79,13 +73,8 @@ def refused(error: OSError, message: str) -> ConfigError:
 
 def check_text(path: Path, choose: str) -> None:
     """Raises ConfigError for a path that is not UTF-8: messages, URLs and records that contain it are text."""
-    try:
-        os.fspath(path).encode()
-    except UnicodeEncodeError as error:
-        raise ConfigError(
-            f"{os.fsencode(path).decode('utf-8', 'backslashreplace')}: this path is not UTF-8; choose another with"
-            f" {choose}"
-        ) from error
+    if (shown := os.fsencode(path).decode("utf-8", "backslashreplace")) != str(path):
+        raise ConfigError(f"{shown}: this path is not UTF-8; choose another with {choose}")
 
 
 def check_writable(
@@ -99,9 +88,8 @@ def check_writable(
     """
     import tempfile
 
-    folder = Path(os.path.abspath(folder))
+    there = folder = Path(os.path.abspath(folder))
     check_text(folder, choose)
-    there = folder
     try:
         while not os.path.lexists(there):
             there = there.parent
@@ -113,10 +101,10 @@ def check_writable(
         if may_be_full and error.errno in (errno.ENOSPC, errno.EDQUOT):
             return
         why = _REMEDIES.get(error.errno or 0, error.strerror or str(error))
-        raise refused(
-            error,
-            f"cannot write to {folder}: {why}; if this cannot be changed, choose another folder with {choose}",
-        ) from error
+        text = (
+            f"cannot write to {folder}: {why}; if this cannot be changed, choose another folder with {choose}"
+        )
+        raise refused(error, text) from error
     n_bytes, least_inodes = free.f_bavail * free.f_frsize, LEAST_INODES if free.f_files else 0
     if not may_be_full and (n_bytes < least_bytes or free.f_favail < least_inodes):
         raise MachineError(
@@ -179,10 +167,7 @@ LOCAL = "local"
 
 
 def check_installed(extra: str) -> None:
-    """Raises ConfigError, with the install command, when a module of the package's extra is missing.
-
-    `LOCAL`: the coordinator's and the gateway's. The environments may be in another installation.
-    """
+    """Raises ConfigError, with the install command, when a module of an extra (or of `LOCAL`) is missing."""
     parts = ("coordinator", "gateway") if extra == LOCAL else (extra,)
     for module, its in EXTRAS.items():
         if its in parts and importlib.util.find_spec(module) is None:

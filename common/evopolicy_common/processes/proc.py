@@ -65,11 +65,9 @@ def table() -> list[Stat]:
 
 
 def family(root: int, *, spare: Collection[int] = ()) -> list[Stat]:
-    """The process `root` and all below it, parents before children, zombies included.
-
-    Leaves out `spare` and everything below it. Reads the process table only once: with two reads, a process started by
-    a spared one in between would look like an orphan.
-    """
+    """The process `root` and all below it, parents first, zombies included, without `spare` and all below it.
+    Reads the process table once: between two reads, a spared process could start one that looks like an
+    orphan."""
     children: dict[int, list[Stat]] = {}
     stack: list[Stat] = []
     for each in table():

@@ -28,16 +28,16 @@ _MAKING_S = 60.0
 
 @contextlib.contextmanager
 def scratch_folder(kind: str) -> Iterator[Path]:
-    """A new private folder `evopolicy-<kind>-…` inside the `with`; deletes what killed owners have left.
-
-    Raises MachineError as `check_scratch` does, such as when the system's temporary folder is full.
-    """
+    """A new private folder `evopolicy-<kind>-…`; deletes those of killed owners. Raises MachineError."""
     check_scratch()
     clear_stale(kind)
     root = Path(tempfile.mkdtemp(prefix=f"evopolicy-{kind}-"))
     lock = -1
     try:
-        lock = _own(root)
+        unnamed = root / f".{_OWNER}"
+        lock = os.open(unnamed, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        unnamed.rename(root / _OWNER)
         yield root
     finally:
         remove_tree(root)
@@ -69,11 +69,8 @@ def clear_stale(kind: str) -> int:
 
 
 def remove_tree(folder: Path) -> None:
-    """Deletes a folder and its content, as far as this user may; never raises for its content.
-
-    A sandboxed program may have nested folders deeper than Python recurses, or removed its own permissions.
-    Nothing may change the folder meanwhile.
-    """
+    """Deletes a folder and its content, as far as this user may; never raises for its content, which may nest
+    deeper than Python recurses or lack permissions. Nothing may change the folder meanwhile."""
     with contextlib.suppress(RecursionError):
         shutil.rmtree(folder, ignore_errors=True)
     if folder.exists() and not folder.is_symlink():
@@ -82,10 +79,7 @@ def remove_tree(folder: Path) -> None:
 
 
 def give_back_rights(folder: Path) -> None:
-    """Restores this user's permissions to list, enter and write its own folder, which a program may have removed.
-
-    A missing folder is no error.
-    """
+    """Restores this user's permissions to list, enter and write its own folder; a missing one is no error."""
     with contextlib.suppress(FileNotFoundError):
         mode = stat.S_IMODE(folder.stat().st_mode)
         if mode & stat.S_IRWXU != stat.S_IRWXU:
@@ -123,12 +117,3 @@ def _flatten_away(folder: Path) -> None:
 
 def _is_folder(name: str, parent: int) -> bool:
     return stat.S_ISDIR(os.stat(name, dir_fd=parent, follow_symlinks=False).st_mode)
-
-
-def _own(root: Path) -> int:
-    """Creates and locks the folder's owner file; returns the lock's descriptor."""
-    unnamed = root / f".{_OWNER}"
-    lock = os.open(unnamed, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
-    fcntl.flock(lock, fcntl.LOCK_EX)
-    unnamed.rename(root / _OWNER)
-    return lock

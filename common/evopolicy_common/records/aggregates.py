@@ -17,8 +17,7 @@ _SCALE = 520
 
 
 def mean(values: Sequence[float]) -> float:
-    """Arithmetic mean, correctly rounded, so independent of the order; NaN without values, NaN or infinite if a value
-    is."""
+    """Arithmetic mean, correctly rounded, in any order; NaN without values, NaN or infinite if a value is."""
     try:
         return math.fsum(values) / len(values) if values else math.nan
     except (ValueError, OverflowError):

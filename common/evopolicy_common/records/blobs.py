@@ -37,39 +37,32 @@ def is_digest(text: str) -> bool:
     return _DIGEST.fullmatch(text) is not None
 
 
-def fsync_directory(path: Path) -> None:
+def fsync_directory(path: Path, sync: Callable[[int], object] = os.fsync) -> None:
     """Makes the directory's entries (a rename, a new file) durable."""
     fd = os.open(path, os.O_RDONLY | os.O_DIRECTORY)
     try:
-        os.fsync(fd)
+        sync(fd)
     finally:
         os.close(fd)
 
 
 def sync_filesystem(path: Path) -> None:
-    """Makes all earlier writes to the directory's file system durable, with one flush for many files.
+    """Makes all earlier writes to the directory's file system durable, with one flush. Raises OSError."""
 
-    Raises OSError when something could not be written.
-    """
-    fd = os.open(path, os.O_RDONLY | os.O_DIRECTORY)
-    try:
+    def sync(fd: int) -> None:
         syncfs = getattr(ctypes.CDLL(None, use_errno=True), "syncfs", None)
         if syncfs is None:
-            # Not Linux.
-            os.sync()
+            os.sync()  # not Linux
         elif syncfs(fd) != 0:
             number = ctypes.get_errno()
             raise OSError(number, os.strerror(number), str(path))
-    finally:
-        os.close(fd)
+
+    fsync_directory(path, sync)
 
 
 def write_atomically(path: Path, data: bytes, *, mode: int = 0o644, durable: bool = True) -> None:
-    """Replaces `path` by a file with `data`: readers see either the old bytes or the new, never a part.
-
-    Raises StorageError with the path when the file cannot be written, ConfigError for a pipe, a device or a folder of
-    that name.
-    """
+    """Replaces `path` by a file with `data`: readers see the old bytes or the new, never a part. Raises
+    StorageError, and ConfigError when `path` is a pipe, a device or a folder."""
     try:
         if path.exists() and not path.is_file():
             raise ConfigError(f"{path} is not a regular file; name another")
@@ -93,8 +86,7 @@ def write_atomically(path: Path, data: bytes, *, mode: int = 0o644, durable: boo
 
 @contextlib.contextmanager
 def announcing(path: Path | None) -> Iterator[Callable[[bytes], None]]:
-    """Yields a function that writes the private file at `path` (None: nowhere); a file that it wrote is removed at the
-    end."""
+    """Yields a function that writes a private file at `path` (None: nowhere), removed at the end."""
     with contextlib.ExitStack() as written:
 
         def write(data: bytes) -> None:
@@ -209,8 +201,7 @@ class BlobStore:
             part.unlink(missing_ok=True)
 
     def delete(self, digest: str, unless_changed: FileState | None = None) -> int:
-        """Deletes the blob and returns the bytes freed; 0 when it was not stored, or was uploaded again since its file
-        was in the state `unless_changed`."""
+        """Deletes the blob and returns its bytes; 0 when it is not stored, or in another state."""
         path = self.path(digest)
         try:
             status = path.stat()
@@ -238,9 +229,8 @@ class BlobStore:
     def _make_room(self, part: Path) -> None:
         """Drops a sender's oldest unfinished uploads when it has too many."""
         begun = [each for each in self._parts.glob(f"{part.name.partition('-')[0]}-*") if each != part]
-        for old in sorted(begun, key=lambda each: each.stat().st_mtime)[
-            : max(0, len(begun) + 1 - MAX_UNFINISHED)
-        ]:
+        begun.sort(key=lambda each: each.stat().st_mtime, reverse=True)
+        for old in begun[MAX_UNFINISHED - 1 :]:
             old.unlink(missing_ok=True)
 
     def _finish(self, part: Path, digest: str) -> None:
@@ -267,5 +257,5 @@ def _folded(sender: str) -> str:
     return digest_of(sender.encode())[:16]
 
 
-def _state(found: os.stat_result) -> FileState:
-    return found.st_ino, found.st_mtime_ns
+def _state(status: os.stat_result) -> FileState:
+    return status.st_ino, status.st_mtime_ns

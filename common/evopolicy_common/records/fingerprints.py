@@ -19,7 +19,7 @@ def comparable(fingerprints: Sequence[Mapping[str, str]]) -> list[dict[str, str]
     detailed = [each for each in fingerprints if "adapter" in each]
     names = {name for each in detailed for name in each}
     definitions = {each.get("definition", "") for each in detailed}
-    found = []
+    compared = []
     for each in fingerprints:
         parts = dict(each)
         if "adapter" in parts:
@@ -29,5 +29,5 @@ def comparable(fingerprints: Sequence[Mapping[str, str]]) -> list[dict[str, str]
             # Packages of other environments are irrelevant here, and the older run did not list what is missing here.
             parts = {name: value for name, value in parts.items() if name in names and name != _CODE}
             parts |= {"adapter": FIRST, "definition": min(definitions)}
-        found.append(parts)
-    return found
+        compared.append(parts)
+    return compared

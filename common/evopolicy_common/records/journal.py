@@ -15,6 +15,7 @@ later version do not change stored data.
 from __future__ import annotations
 
 import hashlib
+import itertools
 from collections.abc import Iterable
 from typing import Any
 
@@ -168,22 +169,20 @@ _OWN = ("validation_ineligible", "submits", "record")
 
 def _record(finished: RunFinished) -> dict[str, Any]:
     sent = finished.agent.get("record")
-    found = {name: sent[name] for name in GATEWAY_SIDE if name in sent} if isinstance(sent, dict) else {}
+    fields = {name: sent[name] for name in GATEWAY_SIDE if name in sent} if isinstance(sent, dict) else {}
     audit, fingerprint = finished.audit, finished.fingerprint
     hashes = {name: f"sha256:{digest}" for name, digest in finished.split_hashes.items()}
     for name, split in (("train", "train"), ("valid", "validation"), ("heldout", "heldout")):
-        found[f"versions.data_{name}_hash"] = hashes.get(f"{name}.json", hashes.get(split, ""))
+        fields[f"versions.data_{name}_hash"] = hashes.get(f"{name}.json", hashes.get(split, ""))
     if finished.random_heldout_returns:
-        found["outcome.random_reference.seeded_by"] = "case" if finished.reference_by_case else "run"
-    return found | {
+        fields["outcome.random_reference.seeded_by"] = "case" if finished.reference_by_case else "run"
+    for name in ("queue", "rollout", "finalise"):
+        fields[f"timing.{name}_s"] = round(float(finished.wall_s.get(name, 0.0)), 3)
+    return fields | {
         "env_title": finished.env_title,
         "env_family": finished.env_family,
         "hidden_isolation": finished.hidden_isolation,
         "outcome.closed_reason": finished.closed_reason,
-        **{
-            f"timing.{name}_s": round(float(finished.wall_s.get(name, 0.0)), 3)
-            for name in ("queue", "rollout", "finalise")
-        },
         "versions.env": finished.env_version,
         "versions.env_deterministic": finished.deterministic,
         "versions.fingerprint": {} if fingerprint is None else fingerprint.flat(),
@@ -226,16 +225,11 @@ def head_after(head: str, entry: bytes) -> str:
 
 def heads(entries: Iterable[bytes]) -> list[str]:
     """The head after each entry."""
-    found, head = [], EMPTY_HEAD
-    for entry in entries:
-        head = head_after(head, entry)
-        found.append(head)
-    return found
+    return list(itertools.accumulate(entries, head_after, initial=EMPTY_HEAD))[1:]
 
 
 def epoch_of(secret: bytes) -> str:
-    """The public name of the epoch whose cases derive from `secret` (256 random bits, which the name does not
-    reveal)."""
+    """The public name of the epoch whose cases derive from `secret`, 256 random bits."""
     return hashlib.sha256(_EPOCH + secret).hexdigest()[:16]
 
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import itertools
 import json
-import math
 from collections.abc import Iterable, Sequence
 from typing import Any
 
@@ -31,19 +30,25 @@ def json_bytes(value: Any) -> bytes:
         return orjson.dumps(cleaned, option=orjson.OPT_SERIALIZE_NUMPY)
     except orjson.JSONEncodeError:
         # Hostile policies can produce such values: lone surrogates, integers of more than 64 bits.
-        return json.dumps(_odd(cleaned), ensure_ascii=True, separators=(",", ":"), allow_nan=False).encode()
+        return json.dumps(cleaned, separators=(",", ":"), allow_nan=False, default=_numpy_as_plain).encode()
+
+
+def _numpy_as_plain(value: Any) -> Any:
+    return json.loads(orjson.dumps(value, option=orjson.OPT_SERIALIZE_NUMPY))
 
 
 def plain(value: Any) -> Any:
     """`value` with every number that JSON cannot represent as text; arrays without such numbers stay arrays."""
-    if isinstance(value, float):
-        return value if math.isfinite(value) else _name(value)
+    if isinstance(value, float | np.floating):
+        if not np.isfinite(value):
+            return "NaN" if np.isnan(value) else "Inf" if value > 0 else "-Inf"
+        return float(value) if isinstance(value, np.floating) and value.dtype.itemsize > 8 else value
     if value is None or isinstance(value, str | bool | int):
         return value
     if isinstance(value, np.ndarray):
         return _plain_array(value)
     if isinstance(value, np.generic):
-        return _plain_scalar(value)
+        return plain(value.item())
     if isinstance(value, dict):
         return {str(key): plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
@@ -59,37 +64,11 @@ def _plain_array(array: np.ndarray[Any, Any]) -> Any:
     if array.dtype.kind == "f":
         if array.dtype.itemsize > 8:
             array = array.astype(np.float64)
-        if np.isfinite(array).all():
-            return np.ascontiguousarray(array)
-        return [plain(item) for item in array]
-    if array.dtype.kind in "iub":
-        return np.ascontiguousarray(array)
-    return [plain(item) for item in array.tolist()]
-
-
-def _plain_scalar(value: np.generic) -> Any:
-    if isinstance(value, np.floating):
-        if not np.isfinite(value):
-            return _name(float(value))
-        return float(value) if value.dtype.itemsize > 8 else value
-    return plain(value.item())
-
-
-def _name(value: float) -> str:
-    if math.isnan(value):
-        return "NaN"
-    return "Inf" if value > 0 else "-Inf"
-
-
-def _odd(value: Any) -> Any:
-    """Converts numpy values to lists for the standard library's encoder."""
-    if isinstance(value, dict):
-        return {key: _odd(item) for key, item in value.items()}
-    if isinstance(value, list):
-        return [_odd(item) for item in value]
-    if isinstance(value, np.ndarray | np.generic):
-        return json.loads(orjson.dumps(value, option=orjson.OPT_SERIALIZE_NUMPY))
-    return value
+        if not np.isfinite(array).all():
+            return [plain(item) for item in array]
+    elif array.dtype.kind not in "iub":
+        return [plain(item) for item in array.tolist()]
+    return np.ascontiguousarray(array)
 
 
 # ---- rows ----
@@ -106,10 +85,8 @@ def rows_text(
     truncated: Iterable[bool],
     infos: Iterable[Any],
 ) -> bytes:
-    """Lines of `trajectory.jsonl` from step `first` on: the same bytes as `json_bytes` of each row, encoded at once.
-
-    `obs` None: observations are stored in a file of their own.
-    """
+    """Lines of `trajectory.jsonl` from step `first` on: the bytes of `json_bytes` of each row, encoded at
+    once. `obs` None: observations are stored in a file of their own."""
     columns = (itertools.repeat(None) if obs is None else obs, actions, rewards, terminated, truncated, infos)
     rows = [
         {

@@ -30,10 +30,8 @@ _decoder = msgspec.json.Decoder(_Call)
 
 
 def before(folder: Path, starts: Sequence[str]) -> list[str]:
-    """For each submit of the run at `folder`, the calls since the one before; empty without any, or without a ledger.
-
-    `starts`: the submits' `submit_started_at`, in their order.
-    """
+    """For each submit of the run at `folder`, the calls since the one before; empty without any, or a ledger.
+    `starts`: the submits' `submit_started_at`, in their order."""
     calls: list[list[_Call]] = [[] for _ in range(len(starts) + 1)]
     try:
         lines = read_regular(folder / LEDGER, _MAX_BYTES).splitlines()
@@ -45,12 +43,10 @@ def before(folder: Path, starts: Sequence[str]) -> list[str]:
             calls[bisect.bisect_right(starts, utc_text(call.at))].append(call)
         except (*DECODE_ERRORS, OverflowError, OSError):
             continue
-    return [_words(some) for some in calls[:-1]]
+    return [_words(some) if some else "" for some in calls[:-1]]
 
 
 def _words(calls: Sequence[_Call]) -> str:
-    if not calls:
-        return ""
     failed = sum(not 200 <= call.status < 300 or call.broken for call in calls)
     return (
         f"{counted(len(calls), 'model call')}{f' ({failed:,} failed)' if failed else ''},"

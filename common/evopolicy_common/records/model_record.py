@@ -71,8 +71,7 @@ def key_of(data: bytes) -> str:
 
 
 class Kept(msgspec.Struct, frozen=True, kw_only=True):
-    """A canonical request as content. The elements of its lists are content of their own, which the next request
-    repeats."""
+    """A canonical request. Elements of its lists are content of their own: requests repeat them."""
 
     plain: dict[str, Any]
     """The fields that are no lists."""
@@ -148,18 +147,17 @@ class Pack:
 
 
 def read_calls(folder: Path) -> list[Call]:
-    """The calls of a record, by their start; without lines that cannot be read. Raises ConfigError when there is
-    none."""
+    """The readable calls of a record, by their start. Raises ConfigError when there is no record."""
     path = folder / CALLS
     try:
         lines = read_regular(path, MAX_CALLS * MAX_CALL_BYTES).splitlines()
     except OSError as error:
         raise ConfigError(f"{path} cannot be read: {error.strerror or error}") from error
-    found = []
+    calls = []
     for line in lines:
         with contextlib.suppress(*DECODE_ERRORS):
-            found.append(_decoder.decode(line))
-    return sorted(found, key=lambda call: call.n)
+            calls.append(_decoder.decode(line))
+    return sorted(calls, key=lambda call: call.n)
 
 
 def stopped(run: Path) -> str:

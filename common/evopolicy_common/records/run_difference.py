@@ -91,15 +91,14 @@ def differences(left: Path, right: Path) -> list[str]:
     return lines
 
 
-def shortened(found: Sequence[str], left: Path, right: Path) -> list[str]:
-    """The lines of `differences(left, right)` for people: scores first, and folders in place of files that one run
-    lacks."""
+def shortened(differing: Sequence[str], left: Path, right: Path) -> list[str]:
+    """`differences` for people: scores first, and folders in place of files that one run lacks."""
     ends = tuple(f": only in {side}" for side in (left, right))
-    scores = [line for line in found if line.startswith("run.json: outcome.")]
+    scores = [line for line in differing if line.startswith("run.json: outcome.")]
     scores.sort(key=lambda line: not line.startswith("run.json: outcome.final_score:"))
-    others = [line for line in found if line not in scores and not line.endswith(ends)]
+    others = [line for line in differing if line not in scores and not line.endswith(ends)]
     lacking: dict[str, list[str]] = {}
-    for line in found:
+    for line in differing:
         for end in ends:
             if line.endswith(end):
                 name = line.removesuffix(end)
@@ -125,12 +124,9 @@ def _files(root: Path, old: bool) -> dict[str, Path]:
     paths = {str(path.relative_to(root)): path for path, _ in left_files(root)}
     if old and _is_old(root):
         paths = {_OLD_SYSTEM.sub(r"\1", name): path for name, path in paths.items()}
-    excluded = (*EXCLUDED_FILES, *(OLD_FILES if old else ()))
-    return {
-        name: path
-        for name, path in paths.items()
-        if not any(fnmatch.fnmatchcase(name, pattern) for pattern in excluded)
-    }
+    for pattern in (*EXCLUDED_FILES, *(OLD_FILES if old else ())):
+        paths = {name: path for name, path in paths.items() if not fnmatch.fnmatchcase(name, pattern)}
+    return paths
 
 
 def _file_differences(name: str, left: Path, right: Path, old: bool) -> list[str]:
@@ -171,13 +167,17 @@ def _parse(name: str, data: bytes) -> Any:
 def _value_differences(path: str, left: Any, right: Any) -> list[tuple[str, Any, Any]]:
     """Paths at which two JSON values differ, with both values; a missing field differs from every value."""
     if isinstance(left, dict) and isinstance(right, dict):
-        found = []
+        differing = []
         for key in [*left, *(key for key in right if key not in left)]:
             below = f"{path}.{key}" if path else str(key)
-            found += _value_differences(below, left.get(key, ...), right.get(key, ...))
-        return found
+            differing += _value_differences(below, left.get(key, ...), right.get(key, ...))
+        return differing
     if _objects(left) and _objects(right) and len(left) == len(right):
-        return [found for a, b in zip(left, right, strict=True) for found in _value_differences(path, a, b)]
+        return [
+            differing
+            for a, b in zip(left, right, strict=True)
+            for differing in _value_differences(path, a, b)
+        ]
     # JSON here contains no NaN, so equality is exact.
     return [] if type(left) is type(right) and left == right else [(path, left, right)]
 

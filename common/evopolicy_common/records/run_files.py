@@ -18,24 +18,20 @@ from evopolicy_common.records.run_record import Artifacts, RunRecord, decode_run
 from evopolicy_common.regular_files import read_regular
 
 _SUBMIT = re.compile(r"submit_([0-9]{3,9})")
-
-
 RUN_JSON = "run.json"
 _PLACES = ("workspace/feedback", "checkpoints", "logs")
 """Folders of a run directory whose files are read, whatever `run.json` names."""
 
 
 def read_record(folder: Path) -> RunRecord:
-    """The record of a finished run. Raises OSError when `run.json` cannot be read, ProtocolError when it is damaged or
-    a folder that it names is outside the run directory."""
+    """A finished run's record. Raises OSError, or ProtocolError for a bad file and as `check_places`."""
     record = decode_run_record(read_regular(folder / RUN_JSON))
     check_places(folder, record.artifacts)
     return record
 
 
 def check_places(folder: Path, artifacts: Artifacts) -> None:
-    """Raises ProtocolError when a place of a run's files is outside its directory, also by a link: a report quotes and
-    copies what it finds there."""
+    """Raises ProtocolError when a place of a run's files is outside its directory, also by a link."""
     named = msgspec.structs.asdict(artifacts)
     places = {f"artifacts.{name}": place for name, place in named.items() if place is not None}
     for name, place in {**dict(zip(_PLACES, _PLACES, strict=True)), **places}.items():
@@ -51,25 +47,21 @@ def run_folders(paths: Iterable[Path]) -> tuple[list[Path], list[Path]]:
     A run directory is a folder with a `run.json`, or one of a started run (`workspace/` beside `logs/` or
     `checkpoints/`); it is not searched further. Links below the given paths are not followed.
     """
-    found: set[Path] = set()
+    runs: set[Path] = set()
     without: list[Path] = []
     for path in paths:
         root = path.resolve()
-        if root.is_file() and root.name == "run.json":
-            found.add(root.parent)
-            continue
-        before = len(found)
-        is_repeat = False
+        below = {root.parent} if root.is_file() and root.name == RUN_JSON else set()
         for folder, names, files in os.walk(root):
             begun = "workspace" in names and ("logs" in names or "checkpoints" in names)
-            if "run.json" in files or begun:
-                is_repeat = is_repeat or Path(folder) in found
-                found.add(Path(folder))
+            if RUN_JSON in files or begun:
+                below.add(Path(folder))
                 names.clear()
             names[:] = [name for name in names if not name.startswith(".")]
-        if len(found) == before and not is_repeat:
+        runs |= below
+        if not below:
             without.append(path)
-    return sorted(found), without
+    return sorted(runs), without
 
 
 def no_run_below(*paths: Path) -> str:
@@ -78,10 +70,7 @@ def no_run_below(*paths: Path) -> str:
 
 
 def submit_folders(folder: Path) -> dict[int, Path]:
-    """The folders `submit_NNN` in `folder` by their indices, in order; empty if it has none or does not exist.
-
-    NNN has at least three digits, more if the budget has more.
-    """
+    """The folders `submit_NNN` in `folder` by index, in order; may be empty. NNN has three digits or more."""
     if not folder.is_dir() or folder.is_symlink():
         return {}
     submits = [(match, child) for child in folder.iterdir() if (match := _SUBMIT.fullmatch(child.name))]

@@ -16,7 +16,7 @@ from typing import Any, Literal
 import msgspec
 
 from evopolicy_common.errors import DECODE_ERRORS, ProtocolError
-from evopolicy_common.messages.audit import AuditRecord
+from evopolicy_common.messages.audit import AuditRecord, Committed
 from evopolicy_common.messages.bounds import check_plausible
 from evopolicy_common.messages.environment import (
     FailedEpisodes,
@@ -28,7 +28,6 @@ from evopolicy_common.messages.environment import (
 )
 from evopolicy_common.messages.episode import FailureCategory, ResourceLimits, Tier
 from evopolicy_common.messages.gateway import FeedbackDetail, FinishRule, Profile, SimulationRule, VideoOption
-from evopolicy_common.messages.journal import Committed
 from evopolicy_common.messages.operator import RunEnd
 from evopolicy_common.messages.run_settings import HiddenCases, HiddenIsolation, Start
 from evopolicy_common.records.code_metrics import PUBLISHED_SCHEMA
@@ -134,8 +133,7 @@ class AgentResources(msgspec.Struct, frozen=True, kw_only=True):
     cpu_s: float = 0.0
     """Processor time of all its programs, seconds."""
     memory_peak_bytes: int = 0
-    """Most memory at once: as a cgroup counts it, with cached files; else the greatest sum of resident
-    sizes, seen every 5 s."""
+    """Most memory at once: of the cgroup, with cached files, or sum of resident sizes every 5 s."""
     disk_bytes: int = 0
     """Most space of its files that was seen."""
     ended_for_memory: int = 0
@@ -186,8 +184,7 @@ class Agent(msgspec.Struct, frozen=True, kw_only=True):
     """`codex`, `claude-code`, `command`, `replay`, `evolve`, …"""
     cli_version: str | None = None
     model_string: str | None = None
-    """The model that the harness was configured with, or else the one that answered most; None for agents without a
-    model."""
+    """The model that was configured, or else the one that answered most; None for agents without a model."""
     prompts: str = ""
     """SHA-256 (`sha256:…`) of the operator's prompts; empty: the standard ones."""
     inputs: tuple[AgentInput, ...] = ()
@@ -219,13 +216,11 @@ class ExperimentDimensions(msgspec.Struct, frozen=True, kw_only=True):
     video: VideoOption = "off"
     limits: ResourceLimits | None = None
     simulation: SimulationRule = "allowed"
-    """Whether the agent's rules allow it to simulate the environment. Runs without this field had no rule against
-    it."""
+    """Whether the rules allow the agent to simulate the environment, as runs without this field do."""
     finish: FinishRule = "early"
     """Whether a run whose agent stops before it has spent its budget is scored (`early`) or is an error (`budget`)."""
     step_limit: StepLimit = "natural"
-    """Step limit: that of the published software, or only the environment's own limit, as in all runs from before
-    this field existed."""
+    """Step limit: the published software's, or the environment's own, as in runs from before this field."""
     failed_episodes: FailedEpisodes = "play-on"
     """Whether random actions play an episode on in which the policy failed (`play-on`), or it ends, and the submit has
     no mean return and its checkpoint is not eligible (`end-submit`)."""
@@ -295,8 +290,7 @@ class Outcome(msgspec.Struct, frozen=True, kw_only=True):
     error: str | None = None
     """Why the status is `error` or `cancelled`, for the operator."""
     final_score: float | None = None
-    """The held-out mean return: the run's number in the paper's table. As published, 0.0 for `no_ok_submit`, where
-    it is meaningless; see `score`."""
+    """The held-out mean return, the paper's number. As published, 0.0 for `no_ok_submit`."""
     best_submit_index: int | None = None
     """Index of the submit of the selected checkpoint."""
     val_scores: dict[str, float] | None = None
@@ -314,8 +308,8 @@ class Outcome(msgspec.Struct, frozen=True, kw_only=True):
     or, in runs of earlier versions, made its slot fail there."""
     random_reference: ReferenceScore | None = None
     closed_reason: str = ""
-    """Why submits ended: `budget_spent`, `agent_stopped`, `agent_failed`, `silent`, `wall_limit`,
-    `model_budget_spent`, `disk_limit`, `cancelled`."""
+    """`budget_spent`, `agent_stopped`, `agent_failed`, `silent`, `wall_limit`, `model_budget_spent`,
+    `disk_limit` or `cancelled`: why submits ended."""
     budget_used: int = 0
     """Episodes charged."""
     auxiliary: dict[str, Any] = {}
@@ -333,8 +327,7 @@ class Outcome(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def agent_never_played(self) -> bool:
-        """Whether the agent failed before it used any budget, such as a CLI that did not start: no run of that
-        agent."""
+        """Whether the agent failed before it used any budget, such as a CLI that did not start."""
         return (
             self.status == "no_ok_submit" and self.closed_reason == "agent_failed" and self.budget_used == 0
         )
@@ -418,12 +411,7 @@ class Versions(msgspec.Struct, frozen=True, kw_only=True):
 
     def file_hash(self, split: Split) -> str:
         """The hash of a split's case file; of its cases if there is none."""
-        files: dict[Split, str] = {
-            "train": self.data_train_hash,
-            "validation": self.data_valid_hash,
-            "heldout": self.data_heldout_hash,
-        }
-        return files[split]
+        return str(getattr(self, f"data_{_DATA[split]}_hash"))
 
 
 class RunRecord(msgspec.Struct, frozen=True, kw_only=True):
@@ -469,8 +457,7 @@ class RunRecord(msgspec.Struct, frozen=True, kw_only=True):
     replay_of: str = ""
     """The coordinator's name of the run that `evopolicy replay` played again; empty: a run of its own."""
     trees: dict[str, str] = {}
-    """Submit index (decimal text) to the SHA-256 of `trees/submit_NNN.json`, the workspace at that submit; empty in
-    older files."""
+    """Submit index (decimal text) to the SHA-256 of `trees/submit_NNN.json`; empty in older files."""
 
 
 class _Header(msgspec.Struct, frozen=True, kw_only=True):
@@ -496,9 +483,9 @@ def decode_run_record(data: bytes) -> RunRecord:
     try:
         header = _headers.decode(data)
         if header.schema_version == 1:
-            return _plausible(msgspec.convert(upgraded(msgspec.json.decode(data)), RunRecord))
+            return check_plausible(msgspec.convert(upgraded(msgspec.json.decode(data)), RunRecord))
         if header.schema_version == PUBLISHED_SCHEMA and header.record_version in READABLE_VERSIONS:
-            return _plausible(_runs.decode(data))
+            return check_plausible(_runs.decode(data))
     except (*DECODE_ERRORS, AttributeError, TypeError, ValueError) as error:
         raise ProtocolError(f"not a run record: {error}") from error
     if header.schema_version == PUBLISHED_SCHEMA and header.record_version is None:
@@ -509,11 +496,6 @@ def decode_run_record(data: bytes) -> RunRecord:
         f"run.json has schema_version {header.schema_version} and record_version {header.record_version}; this version"
         f" reads {PUBLISHED_SCHEMA} and {READABLE_VERSIONS[0]} to {RECORD_VERSION}: update evopolicy"
     )
-
-
-def _plausible(record: RunRecord) -> RunRecord:
-    check_plausible(record)
-    return record
 
 
 def sha256_text(digest: str) -> str:

@@ -23,6 +23,7 @@ from evopolicy_common.records.blobs import write_atomically
 from evopolicy_common.regular_files import read_regular
 
 REDACTED = b"[redacted]"
+_REDACTED = REDACTED.decode()
 PASSED = ".passed.json"
 """In a run's folder, mode 0600: `Passed`."""
 PASSED_VALUE = "a value that the run passed to its agent"
@@ -40,8 +41,7 @@ _KEY_OPTION = re.compile(
     r"(?:key|token|secret|passw(?:or)?d|passphrase|credentials?|auth|cookie|pat)",
     re.IGNORECASE,
 )
-"""An option or variable whose value is a secret, such as `--api-key` and `HF_TOKEN`, not `--max-tokens` or
-`--monkey`."""
+"""An option or variable with a secret value: `--api-key`, `HF_TOKEN`; not `--max-tokens`, `--monkey`."""
 # In a JSON line, the letter before a key may be that of an escape. Repetitions are bounded where a match may fail after
 # them: otherwise a line of many beginnings would take quadratic time.
 _START = rb"(?:\b|(?<=\\[nrtbf]))"
@@ -84,12 +84,9 @@ def patterns(data: bytes) -> Iterator[tuple[re.Pattern[bytes], str]]:
     return ((pattern, what) for pattern, what, parts in PATTERNS if any(part in data for part in parts))
 
 
-def found(data: bytes, passed: Passed | None = None) -> Iterator[tuple[int, str]]:
-    """Positions and kinds of secrets: of what looks like one, and of the values that a run has passed.
-
-    A text without a digit is none, and neither is one of few characters, such as the placeholder
-    `sk-xxxxxxxxxxxxxxxx1`.
-    """
+def positions(data: bytes, passed: Passed | None = None) -> Iterator[tuple[int, str]]:
+    """Positions and kinds of secrets: of what looks like one, and of the values that a run has passed. A text
+    without a digit is none, nor one of few characters, such as `sk-xxxxxxxxxxxxxxxx1`."""
     for pattern, what in patterns(data):
         for match in pattern.finditer(data):
             text = match[0]
@@ -160,20 +157,20 @@ def without_keys(value: Any, removed: list[str] | None = None) -> Any:
     if isinstance(value, str):
         return _line(value, removed)
     if isinstance(value, dict):
-        return {name: _value(name, each, removed) for name, each in value.items()}
+        shown = {}
+        for name, each in value.items():
+            # Other settings of such names, such as `auth`, only name a variable or a method.
+            if isinstance(each, str) and each and name.isupper() and _KEY_OPTION.fullmatch(name):
+                removed.append(each)
+                shown[name] = _REDACTED
+            else:
+                shown[name] = without_keys(each, removed)
+        return shown
     if isinstance(value, list | tuple):
         if all(isinstance(each, str) for each in value):
             return _words(value, removed)
         return [without_keys(each, removed) for each in value]
     return value
-
-
-def _value(name: str, value: Any, removed: list[str]) -> Any:
-    # Other settings of such names, such as `auth`, only name a variable or a method.
-    if isinstance(value, str) and value and name.isupper() and _KEY_OPTION.fullmatch(name):
-        removed.append(value)
-        return REDACTED.decode()
-    return without_keys(value, removed)
 
 
 def _line(text: str, removed: list[str]) -> str:
@@ -183,38 +180,33 @@ def _line(text: str, removed: list[str]) -> str:
         words = shlex.split(text)
     n = len(removed)
     shown = _words(words, removed) if len(words) > 1 else []
-    if len(removed) == n:
-        return _look(text, removed)
-    return " ".join(word if REDACTED.decode() in word else shlex.quote(word) for word in shown)
-
-
-def _words(words: Iterable[str], removed: list[str]) -> list[str]:
-    shown: list[str] = []
-    follows = False
-    for word in words:
-        name, equals, value = word.partition("=")
-        is_key = _KEY_OPTION.fullmatch(name) is not None
-        if follows and not word.startswith("--"):
-            removed.append(word)
-            word = REDACTED.decode()
-            follows = False
-        elif is_key and value:
-            removed.append(value)
-            word = f"{name}={REDACTED.decode()}"
-            follows = False
-        else:
-            follows = is_key and not equals and word.startswith("-")
-            word = _line(word, removed)
-        shown.append(word)
-    return shown
-
-
-def _look(text: str, removed: list[str]) -> str:
+    if len(removed) > n:
+        return " ".join(word if _REDACTED in word else shlex.quote(word) for word in shown)
     data = text.encode("utf-8", "surrogateescape")
     for pattern, _ in patterns(data):
         removed += [match[0].decode("utf-8", "surrogateescape") for match in pattern.finditer(data)]
         data = pattern.sub(REDACTED, data)
     return data.decode("utf-8", "surrogateescape")
+
+
+def _words(words: Iterable[str], removed: list[str]) -> list[str]:
+    shown: list[str] = []
+    is_value = False
+    for word in words:
+        name, equals, value = word.partition("=")
+        is_key = _KEY_OPTION.fullmatch(name) is not None
+        if is_value and not word.startswith("--"):
+            removed.append(word)
+            shown.append(_REDACTED)
+            is_value = False
+        elif is_key and value:
+            removed.append(value)
+            shown.append(f"{name}={_REDACTED}")
+            is_value = False
+        else:
+            is_value = is_key and not equals and word.startswith("-")
+            shown.append(_line(word, removed))
+    return shown
 
 
 class PassedValue(msgspec.Struct, frozen=True, kw_only=True):
@@ -279,8 +271,7 @@ def note_passed(path: Path, values: Iterable[str]) -> None:
 
 
 def read_passed(folder: Path) -> Passed | None:
-    """What a run's folder records; None where it has no such file, as those of earlier versions. Raises ConfigError for
-    a damaged file."""
+    """Values that a run's folder records; None without the file. Raises ConfigError for a damaged one."""
     path = folder / PASSED
     try:
         return msgspec.json.decode(read_regular(path, _MAX_FILE_BYTES), type=Passed)

@@ -6,7 +6,6 @@ import hashlib
 import json
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
 
 import msgspec
 
@@ -51,18 +50,11 @@ def holds_splits(folder: Path) -> bool:
 
 def cases_hash(cases: Iterable[Case]) -> str:
     """SHA-256 (hex) of the cases as canonical JSON: sorted keys, no spaces, `options` only if present."""
-    plain = [_plain(case) for case in cases]
+    plain = [
+        {"seed": case.seed} | ({} if case.options is None else {"options": case.options}) for case in cases
+    ]
     text = json.dumps(plain, sort_keys=True, separators=(",", ":"), ensure_ascii=True, allow_nan=False)
     return hashlib.sha256(text.encode("ascii")).hexdigest()
-
-
-def _plain(case: Case) -> dict[str, Any]:
-    return {"seed": case.seed} if case.options is None else {"seed": case.seed, "options": case.options}
-
-
-def _identity(case: Case) -> tuple[int, str]:
-    """Key for comparing two cases: an environment cannot distinguish missing options from empty ones."""
-    return case.seed, json.dumps(case.options or None, sort_keys=True)
 
 
 def read_split_file(path: Path) -> tuple[SplitFile, str]:
@@ -80,14 +72,13 @@ def read_split_file(path: Path) -> tuple[SplitFile, str]:
 
 def overlaps(cases: dict[Split, tuple[Case, ...]]) -> list[str]:
     """Describes each case that occurs more than once, in one split or in several."""
-    findings: list[str] = []
-    first_seen: dict[tuple[int, str], tuple[Split, int]] = {}
+    repeats: list[str] = []
+    places: dict[tuple[int, str], str] = {}
     for split, members in cases.items():
         for number, case in enumerate(members):
-            where = first_seen.setdefault(_identity(case), (split, number))
-            if where == (split, number):
-                continue
-            findings.append(
-                f"seed {case.seed} is {FILE_STEMS[where[0]]} case {where[1]} and {FILE_STEMS[split]} case {number}"
-            )
-    return findings
+            place = f"{FILE_STEMS[split]} case {number}"
+            # An environment cannot distinguish missing options from empty ones.
+            key = (case.seed, json.dumps(case.options or None, sort_keys=True))
+            if (first := places.setdefault(key, place)) != place:
+                repeats.append(f"seed {case.seed} is {first} and {place}")
+    return repeats

@@ -74,8 +74,7 @@ _decoder = msgspec.json.Decoder(Summary)
 def decode_summary(data: bytes) -> Summary:
     """The summary in `data`; unknown fields are skipped. Raises ProtocolError when this version cannot read it."""
     try:
-        summary = _decoder.decode(data)
-        check_plausible(summary)
+        summary = check_plausible(_decoder.decode(data))
     except (*DECODE_ERRORS, ValueError) as error:
         raise ProtocolError(f"not a submit summary: {error}") from error
     if summary.schema_version not in _READ:

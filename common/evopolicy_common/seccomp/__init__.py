@@ -26,11 +26,8 @@ KILLED: Instruction = (RETURN, 0, 0, KILL_PROCESS)
 
 
 def program(machine: str, otherwise: Instruction, body: Iterable[Instruction]) -> bytes:
-    """A complete filter, 8 bytes an instruction: `otherwise` applies to calls of another architecture, `body` to the
-    rest.
-
-    At the start of `body` the call's number is loaded.
-    """
+    """A complete filter, 8 bytes an instruction: `otherwise` applies to calls of another architecture,
+    `body`, which begins with the call's number loaded, to the rest."""
     head = [
         (LOAD, 0, 0, _ARCHITECTURE),
         (JUMP_EQUAL, 1, 0, AUDIT_ARCH[machine]),

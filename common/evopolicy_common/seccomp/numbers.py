@@ -7,13 +7,13 @@ _Table = dict[str, dict[str, int]]
 
 def _parsed(table: str) -> _Table:
     """`NAME=X86_64/AARCH64`, with `-` where an architecture has no such call, as numbers by architecture."""
-    found: _Table = {"x86_64": {}, "aarch64": {}}
+    tables: _Table = {"x86_64": {}, "aarch64": {}}
     for entry in table.split():
         name, _, numbers = entry.partition("=")
-        for calls, number in zip(found.values(), numbers.split("/"), strict=True):
+        for calls, number in zip(tables.values(), numbers.split("/"), strict=True):
             if number != "-":
                 calls[name] = int(number)
-    return found
+    return tables
 
 
 NUMBERS = _parsed("""

@@ -1,5 +1,4 @@
-"""Quantiles of the normal and Student's t distribution and Holm's correction, in plain Python: numpy lacks them, and
-scipy would be a dependency for these alone."""
+"""Quantiles of the normal and Student's t distribution, and Holm's correction, without scipy."""
 
 from __future__ import annotations
 
@@ -29,10 +28,8 @@ def t_two_sided(t: float, df: float) -> float:
 
 @lru_cache(maxsize=65536)
 def t_quantile(p: float, df: float) -> float:
-    """Quantile of Student's t for 0.5 ≤ p < 1 and any `df` > 0, to about 1e-10; infinite `df` gives the normal's.
-
-    Raises ValueError for other arguments.
-    """
+    """Quantile of Student's t for 0.5 ≤ p < 1 and `df` > 0, perhaps infinite, to about 1e-10. Raises
+    ValueError."""
     if not 0.5 <= p < 1.0 or not df > 0.0:
         raise ValueError(
             f"t quantile of p = {p} with {df} degrees of freedom; p is in [0.5, 1) and df above 0"
@@ -57,8 +54,7 @@ def _t_upper(t: float, df: float) -> float:
 
 
 def _incomplete_beta(a: float, b: float, x: float) -> float:
-    """Regularised incomplete beta function, by its continued fraction (Abramowitz and Stegun 26.5.8) with Lentz's
-    method."""
+    """Regularised incomplete beta function: Abramowitz and Stegun's fraction 26.5.8 with Lentz's method."""
     if x <= 0.0 or x >= 1.0:
         return 0.0 if x <= 0.0 else 1.0
     if x > (a + 1.0) / (a + b + 2.0):
@@ -84,8 +80,7 @@ def _away_from_0(value: float) -> float:
 
 
 def holm(p_values: Sequence[float | None]) -> list[float | None]:
-    """Holm's step-down correction: adjusted p values in the given order; None stays None and is not part of the
-    family."""
+    """Holm's step-down correction: adjusted p values in the given order; None stays None."""
     known = sorted((p, i) for i, p in enumerate(p_values) if p is not None)
     adjusted: list[float | None] = [None] * len(p_values)
     largest = 0.0

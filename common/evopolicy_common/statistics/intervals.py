@@ -103,16 +103,12 @@ def difference(first: Floats, second: Floats, *, resamples: int = RESAMPLES, fix
     Over runs and cases if both have two or more runs; with `fixed`, if `first` has, as `second` is one given policy.
     Otherwise over cases alone.
     """
-    value = float(first.mean() - second.mean())
-    over_runs = len(first) > 1 and (len(second) > 1 or fixed)
-    if not over_runs:
-        return over_cases(
-            first.mean(axis=0) - second.mean(axis=0),
-            (first, second) if len(first) == len(second) == 1 else (),
-            resamples=resamples,
-        )
+    by_case = first.mean(axis=0) - second.mean(axis=0)
+    if len(first) < 2 or (len(second) < 2 and not fixed):
+        returns = (first, second) if len(first) == len(second) == 1 else ()
+        return over_cases(by_case, returns, resamples=resamples)
     parts = [components(one) for one in (first, second) if len(one) > 1]
-    return _crossed(value, parts, first.mean(axis=0) - second.mean(axis=0))
+    return _crossed(float(first.mean() - second.mean()), parts, by_case)
 
 
 def mean(returns: Floats, *, resamples: int = RESAMPLES) -> Estimate:
@@ -176,8 +172,7 @@ def stratified(strata: Sequence[Stratum], weights: Sequence[float], over: Over) 
 
 
 def over_cases(values: Floats, returns: Sequence[Floats] = (), *, resamples: int = RESAMPLES) -> Estimate:
-    """The mean of one value per case. `returns` are the returns behind the values if these are single episodes:
-    two-valued returns are counted, not averaged."""
+    """The mean of one value per case. `returns`: those of single episodes; two-valued ones are counted."""
     n = len(values)
     value = float(values.mean())
     if n < LEAST_CASES:
@@ -206,11 +201,8 @@ def over_cases(values: Floats, returns: Sequence[Floats] = (), *, resamples: int
 
 
 def bootstrap_t(columns: Floats, *, resamples: int = RESAMPLES, seed: int = 0) -> Floats:
-    """Half widths of symmetric studentised bootstrap intervals of each column's mean; infinite if too few values
-    differ.
-
-    `columns` is (cases, m); each column is its own sample, resampled with the same draws.
-    """
+    """Half widths of symmetric studentised bootstrap intervals of each column's mean, all resampled with the
+    same draws; infinite if too few values differ. `columns` is (cases, m)."""
     n = len(columns)
     centre, spread = columns.mean(axis=0), columns.std(axis=0, ddof=1)
     varies = spread > _RELATIVE_ZERO * np.maximum(1e-300, np.abs(columns).max(axis=0))
@@ -292,8 +284,7 @@ def _variance(parts: Sequence[Components], shared: float, n_cases: int) -> tuple
 
 
 def _runs_df(variances: Sequence[float], n_runs: Sequence[int]) -> float:
-    """Welch and Satterthwaite's degrees of freedom of a sum of variances of means, at most those of as many runs of
-    each as the fewest."""
+    """Degrees of freedom (Welch, Satterthwaite) of a sum of variances, bounded by the fewest runs."""
     total = sum(variances)
     welch = 1.0 / sum((v / total) ** 2 / (n - 1) for v, n in zip(variances, n_runs, strict=True))
     return min(welch, len(n_runs) * (min(n_runs) - 1.0))

@@ -18,8 +18,7 @@ EXACT_UP_TO = 1 << 13
 
 @lru_cache(maxsize=8)
 def weights(n: int, n_drawn: int, resamples: int, seed: int) -> Floats:
-    """(resamples, n): multinomial counts of `n_drawn` draws with replacement from `n`; rows sum to `n_drawn`.
-    Read-only."""
+    """(resamples, n): counts of `n_drawn` draws with replacement from `n`, read-only."""
     drawn = np.random.default_rng([seed, n, n_drawn]).multinomial(n_drawn, np.full(n, 1.0 / n), resamples)
     counts: Floats = drawn.astype(np.float64)
     counts.setflags(write=False)
@@ -42,8 +41,7 @@ def t_weights(n: int, draws: int, seed: int) -> Floats:
 
 @lru_cache(maxsize=4)
 def label_patterns(n_first: int, n_second: int, n_random: int) -> tuple[Floats, bool]:
-    """(patterns, n_first + n_second) with 1 for the first group and 0 for the second, and whether the patterns are
-    complete. Read-only."""
+    """(patterns, n_first + n_second), 1 for the first group, and whether all are there. Read-only."""
     n = n_first + n_second
     exact = math.comb(n, n_first) <= EXACT_UP_TO
     if exact:

@@ -12,6 +12,7 @@ from functools import cache
 from typing import Annotated, TypeVar, get_args
 
 import msgspec
+from msgspec.msgpack import Decoder, Encoder
 
 from evopolicy_common.errors import DECODE_ERRORS, ProtocolError
 from evopolicy_common.messages import bounds
@@ -42,16 +43,17 @@ MAX_BLOB_BYTES = 1 << 30
 MAX_PACKED_BYTES = 256 << 20
 """Largest blob of a job's packed outcomes, bytes; also the limit for `JobResult.begun`."""
 
-_encoder = msgspec.msgpack.Encoder()
-worker_requests: msgspec.msgpack.Decoder[WorkerRequest] = msgspec.msgpack.Decoder(WorkerRequest)
-worker_replies: msgspec.msgpack.Decoder[WorkerReply] = msgspec.msgpack.Decoder(WorkerReply)
-gateway_requests: msgspec.msgpack.Decoder[GatewayRequest] = msgspec.msgpack.Decoder(GatewayRequest)
-gateway_replies: msgspec.msgpack.Decoder[GatewayReply] = msgspec.msgpack.Decoder(GatewayReply)
-operator_requests: msgspec.msgpack.Decoder[OperatorRequest] = msgspec.msgpack.Decoder(OperatorRequest)
-operator_replies: msgspec.msgpack.Decoder[OperatorReply] = msgspec.msgpack.Decoder(OperatorReply)
-_outcomes: msgspec.msgpack.Decoder[tuple[EpisodeOutcome, ...]] = msgspec.msgpack.Decoder(
+_encoder = Encoder()
+worker_requests: Decoder[WorkerRequest] = Decoder(WorkerRequest)
+worker_replies: Decoder[WorkerReply] = Decoder(WorkerReply)
+gateway_requests: Decoder[GatewayRequest] = Decoder(GatewayRequest)
+gateway_replies: Decoder[GatewayReply] = Decoder(GatewayReply)
+operator_requests: Decoder[OperatorRequest] = Decoder(OperatorRequest)
+operator_replies: Decoder[OperatorReply] = Decoder(OperatorReply)
+_outcomes: Decoder[tuple[EpisodeOutcome, ...]] = Decoder(
     Annotated[tuple[EpisodeOutcome, ...], msgspec.Meta(max_length=1 << 16)]
 )
+_decoder_of = cache(Decoder)
 
 T = TypeVar("T")
 
@@ -71,7 +73,7 @@ def encode(message: Message) -> bytes:
     return data
 
 
-def decode(decoder: msgspec.msgpack.Decoder[T], data: bytes) -> T:
+def decode(decoder: Decoder[T], data: bytes) -> T:
     """The message in `data`. Raises ProtocolError when `decoder` cannot read it."""
     if len(data) > MAX_MESSAGE_BYTES:
         raise ProtocolError(f"a message of {len(data):,} bytes; {MAX_MESSAGE_BYTES:,} are the limit")
@@ -93,11 +95,6 @@ def _check_plain(message: object) -> None:
     if isinstance(message, msgspec.Struct) and type(message) in _REQUESTS:
         for part in bounds.plain_parts(message):
             bounds.check_plain(part)
-
-
-@cache
-def _decoder_of(kind: type[Message]) -> msgspec.msgpack.Decoder[Message]:
-    return msgspec.msgpack.Decoder(kind)
 
 
 def pack_outcomes(outcomes: Sequence[EpisodeOutcome]) -> bytes:

@@ -12,6 +12,7 @@ Rule: tokens and results cross a network inside TLS only, unless the file states
 
 from __future__ import annotations
 
+import asyncio
 import ipaddress
 import os
 import re
@@ -66,6 +67,7 @@ def local_state_dir() -> Path:
 
 _MOST_BYTES = 1 << 20
 """Of a credentials file or a key."""
+_LOOK_S = 0.02
 SWEEP_STATE = ".cluster"
 """The state folder of `evopolicy suite --local`, in the sweep's folder."""
 
@@ -77,32 +79,31 @@ def write(credentials: Credentials, path: Path) -> None:
 
 
 def read(path: Path) -> Credentials:
-    """The credentials in `path`, with absolute paths of certificates.
-
-    Raises ConfigError when the file or a certificate is missing, the file is malformed, or others can read it or its
-    private key.
-    """
+    """The credentials in `path`, with absolute paths. Raises ConfigError if missing, malformed or not
+    private."""
     data = _read_private(path)
     try:
-        found = msgspec.json.decode(data, type=Credentials)
+        credentials = msgspec.json.decode(data, type=Credentials)
     except DECODE_ERRORS as error:
         raise ConfigError(f"{path} is not a credentials file: {error}") from error
-    if found.tls is None:
-        return found
+    if credentials.tls is None:
+        return credentials
     folder = Path(os.path.abspath(path.parent))
-    tls = TlsFiles(**{name: str(folder / place) for name, place in msgspec.structs.asdict(found.tls).items()})
+    tls = TlsFiles(
+        **{name: str(folder / place) for name, place in msgspec.structs.asdict(credentials.tls).items()}
+    )
     for name in (tls.root_ca, tls.certificate):
         if not Path(name).is_file():
             raise ConfigError(f"{name}, which {path} names, is missing: copy the whole folder")
     _read_private(Path(tls.private_key))
-    return msgspec.structs.replace(found, tls=tls)
+    return msgspec.structs.replace(credentials, tls=tls)
 
 
 def at(credentials: Credentials, connect: tuple[str, ...]) -> Credentials:
     """The same credentials with the endpoints `connect`, if any. Raises ConfigError as `check_endpoints` does."""
-    found = msgspec.structs.replace(credentials, endpoints=connect) if connect else credentials
-    check_endpoints(found)
-    return found
+    changed = msgspec.structs.replace(credentials, endpoints=connect) if connect else credentials
+    check_endpoints(changed)
+    return changed
 
 
 def check_endpoints(credentials: Credentials) -> None:
@@ -137,8 +138,7 @@ def stays_on_machine(endpoint: str) -> bool:
 
 
 def publish(endpoints: tuple[str, ...], folder: Path) -> None:
-    """Registers `folder` as the place of the credentials of these endpoints, for this user's commands. Raises
-    ConfigError where the registry cannot be made."""
+    """Registers `folder` for these endpoints, for this user's commands. Raises ConfigError if it cannot."""
     registry = state_home() / "clusters"
     try:
         registry.mkdir(parents=True, exist_ok=True, mode=0o700)
@@ -179,10 +179,10 @@ def find(role: Role, connect: tuple[str, ...] = (), file: Path | None = None) ->
                 f"no {role} credentials{where}: looked at {file}. Start evopolicy-coordinator on this machine, or name"
                 f" a folder that `evopolicy-coordinator certs issue {role} NAME` wrote with --credentials{local}"
             )
-    found = read(file)
-    if found.role != role:
-        raise ConfigError(f"{file} holds credentials of role {found.role!r}; this command needs {role!r}")
-    return at(found, connect)
+    own = read(file)
+    if own.role != role:
+        raise ConfigError(f"{file} holds credentials of role {own.role!r}; this command needs {role!r}")
+    return at(own, connect)
 
 
 def _read_private(path: Path) -> bytes:
@@ -210,3 +210,25 @@ def state_home() -> Path:
 def _registered(endpoint: str) -> Path:
     """The file by which this user's commands find a cluster of this machine."""
     return state_home() / "clusters" / digest_of(endpoint.encode())[:32]
+
+
+class Ready(msgspec.Struct, frozen=True, kw_only=True):
+    """How to reach a coordinator."""
+
+    cluster: str
+    endpoints: tuple[str, ...]
+    """Endpoints for processes of this machine; those of `tls/`, which need certificates, come last."""
+    credentials: dict[Role, str]
+    """Paths of this machine's credentials files by role."""
+    state: str
+    note: str = ""
+    """A note for the operator on the cases of new runs; empty for none."""
+
+
+async def read_ready(path: Path, failed: asyncio.Future[None]) -> Ready:
+    """Waits for the file and reads it. `failed` ends only with an error, which is raised here if it comes first."""
+    while not path.exists():
+        if failed.done():
+            failed.result()
+        await asyncio.sleep(_LOOK_S)
+    return msgspec.json.decode(path.read_bytes(), type=Ready)

@@ -50,10 +50,8 @@ def bound(host: str, port: int) -> socket.socket:
 async def serving(
     app: ASGIApp, sock: socket.socket, *, certificate: Path | None = None, private_key: Path | None = None
 ) -> AsyncIterator[asyncio.Task[None]]:
-    """Serves `app` inside the `async with`, and closes `sock`; the task ends early only when the service fails.
-
-    Raises OSError when the address is taken by another listener.
-    """
+    """Serves `app` inside the `async with`, and closes `sock`; the task ends early only when the service
+    fails. Raises OSError when the address is taken by another listener."""
     config = uvicorn.Config(
         app,
         http=TimedProtocol,

@@ -11,36 +11,9 @@ from typing import Literal
 from msgspec.structs import replace
 
 from evopolicy_common.errors import BrokenEnvironmentError, EvopolicyError, RefusedError
+from evopolicy_common.messages import operator as ops
 from evopolicy_common.messages.environment import Split
 from evopolicy_common.messages.episode import BlobRef, EpisodeOutcome
-from evopolicy_common.messages.operator import (
-    AgentGone,
-    ApproveEnvironment,
-    CancelRun,
-    DescribeEnvironment,
-    Disclose,
-    Done,
-    EnvironmentsReply,
-    EnvironmentsRequest,
-    EnvironmentState,
-    Evaluate,
-    EvaluationPage,
-    EvaluationPoll,
-    EvaluationStarted,
-    FurtherCases,
-    FurtherCasesRequest,
-    JournalPage,
-    JournalRequest,
-    OfferedEnvironment,
-    OpeningRequest,
-    RecordedRequest,
-    RepinRun,
-    Rescore,
-    RunOpening,
-    SetWorker,
-    Signed,
-    SignRequest,
-)
 from evopolicy_common.messages.status import FromOperator, StatusReply, StatusRequest
 from evopolicy_common.refusals import Refusal
 from evopolicy_common.wire.requests import Wanted, operator_requests
@@ -59,8 +32,7 @@ class OperatorClient:
     """One operator's link. Fills in the token of each message. Raises RefusedError where the coordinator refuses."""
 
     def __init__(self, link: Link, *, own: bool = False) -> None:
-        """`own`: the command started this cluster, so that no other worker will come. Evaluations then raise
-        BrokenEnvironmentError when their environment fails on its workers."""
+        """`own`: the command started this cluster; BrokenEnvironmentError then ends an evaluation."""
         self._token = link.credentials.token
         self.own = own
         self._requests = operator_requests(link)
@@ -79,29 +51,29 @@ class OperatorClient:
 
     async def environments(
         self,
-    ) -> tuple[list[OfferedEnvironment], dict[str, tuple[str, ...]], dict[str, dict[str, str]]]:
-        """The environments that connected workers offer; those that they describe on first use, with the workers; and
-        those that failed, with the reasons by worker."""
-        offered: list[OfferedEnvironment] = []
+    ) -> tuple[list[ops.OfferedEnvironment], dict[str, tuple[str, ...]], dict[str, dict[str, str]]]:
+        """The offered environments; those described on first use, with the workers; those that failed, and
+        why."""
+        offered: list[ops.OfferedEnvironment] = []
         while True:
-            message = EnvironmentsRequest(cursor=len(offered))
-            page = await self._ask("environments", message, EnvironmentsReply)
+            message = ops.EnvironmentsRequest(cursor=len(offered))
+            page = await self._ask("environments", message, ops.EnvironmentsReply)
             offered += page.environments
             if page.finished:
                 return offered, page.undescribed, page.failed
 
     async def approve(self, env: str, digest: str) -> None:
         """Lets runs use this definition of an environment that does not ship."""
-        await self._ask("approve", ApproveEnvironment(env=env, digest=digest), Done)
+        await self._ask("approve", ops.ApproveEnvironment(env=env, digest=digest), ops.Done)
 
     async def set_worker(self, worker: str, state: Literal["active", "paused", "draining"]) -> None:
-        await self._ask("worker", SetWorker(worker=worker, state=state), Done)
+        await self._ask("worker", ops.SetWorker(worker=worker, state=state), ops.Done)
 
-    async def describe(self, message: DescribeEnvironment) -> EnvironmentState:
+    async def describe(self, message: ops.DescribeEnvironment) -> ops.EnvironmentState:
         """Data for replaying a finished run's episodes. Waits for a worker that describes the environment now."""
         until = time.monotonic() + DESCRIPTION_S
         while True:
-            reply = await self._ask("describe", message, EnvironmentState)
+            reply = await self._ask("describe", message, ops.EnvironmentState)
             if not reply.awaited or time.monotonic() > until:
                 return reply
             await asyncio.sleep(DESCRIPTION_PAUSE_S)
@@ -110,27 +82,28 @@ class OperatorClient:
 
     async def cancel(self, run: str) -> None:
         """Ends a run without a score."""
-        await self._ask("cancel", CancelRun(run=run), Done)
+        await self._ask("cancel", ops.CancelRun(run=run), ops.Done)
 
     async def agent_gone(self, run: str, boot_id: str = "") -> None:
         """Ends the permit of a run's agent that is no longer alive, or no longer on the kernel `boot_id`."""
-        await self._ask("agent_gone", AgentGone(run=run, boot_id=boot_id), Done)
+        await self._ask("agent_gone", ops.AgentGone(run=run, boot_id=boot_id), ops.Done)
 
     async def repin(self, run: str, fingerprint_class: str, reason: str) -> None:
         """Lets a run continue with workers of another fingerprint class."""
-        await self._ask("repin", RepinRun(run=run, fingerprint_class=fingerprint_class, reason=reason), Done)
+        await self._ask(
+            "repin",
+            ops.RepinRun(run=run, fingerprint_class=fingerprint_class, reason=reason),
+            ops.Done,
+        )
 
     async def recorded(
         self, run: str, split: Split, submit_index: int, *, timeout_s: float | None = None
     ) -> AsyncIterator[EpisodeOutcome]:
-        """Stored outcomes of a finished run, in order of arrival.
-
-        Raises RefusedError for a run that is unfinished or no longer known.
-        """
+        """Stored outcomes of a finished run, in order of arrival. Raises RefusedError for any other run."""
         cursor, finished = 0, False
         while not finished:
-            message = RecordedRequest(run=run, split=split, submit_index=submit_index, cursor=cursor)
-            page = await self._ask("recorded", message, EvaluationPage, timeout_s=timeout_s)
+            message = ops.RecordedRequest(run=run, split=split, submit_index=submit_index, cursor=cursor)
+            page = await self._ask("recorded", message, ops.EvaluationPage, timeout_s=timeout_s)
             cursor, finished = page.cursor, page.finished
             for outcome in page.outcomes:
                 yield outcome
@@ -139,46 +112,46 @@ class OperatorClient:
 
     async def disclose(self, runs: tuple[str, ...]) -> None:
         """Makes the cases of finished runs public. Raises RefusedError while any run with the same secret is open."""
-        await self._ask("disclose", Disclose(runs=runs), Done)
+        await self._ask("disclose", ops.Disclose(runs=runs), ops.Done)
 
     async def journal(self) -> list[bytes]:
         """All entries of the coordinator's journal."""
         entries: list[bytes] = []
         while True:
-            page = await self._ask("journal", JournalRequest(cursor=len(entries)), JournalPage)
+            page = await self._ask("journal", ops.JournalRequest(cursor=len(entries)), ops.JournalPage)
             entries += page.entries
             if page.finished:
                 return entries
 
-    async def opening(self, run: str) -> RunOpening:
+    async def opening(self, run: str) -> ops.RunOpening:
         """The committed document of a disclosed run."""
-        return await self._ask("opening", OpeningRequest(run=run), RunOpening)
+        return await self._ask("opening", ops.OpeningRequest(run=run), ops.RunOpening)
 
-    async def sign(self, digest: str) -> Signed:
+    async def sign(self, digest: str) -> ops.Signed:
         """The coordinator's signature of the manifest whose SHA-256 is `digest`."""
-        return await self._ask("sign", SignRequest(digest=digest), Signed)
+        return await self._ask("sign", ops.SignRequest(digest=digest), ops.Signed)
 
     # Episodes outside any run.
 
-    async def further_cases(self, run: str, name: str, n: int) -> FurtherCases:
+    async def further_cases(self, run: str, name: str, n: int) -> ops.FurtherCases:
         """`n` hidden cases for the re-score `name` of a finished run, disjoint from its splits."""
-        return await self._ask("further", FurtherCasesRequest(run=run, name=name, n=n), FurtherCases)
+        return await self._ask("further", ops.FurtherCasesRequest(run=run, name=name, n=n), ops.FurtherCases)
 
     async def evaluate(
-        self, message: Evaluate | Rescore
+        self, message: ops.Evaluate | ops.Rescore
     ) -> AsyncGenerator[tuple[EpisodeOutcome | None, int, str], None]:
         """Yields outcomes as they arrive; every few seconds without one, yields what the evaluation waits for.
 
         Yields `(outcome, total, "")` or `(None, total, waits_for)`; `total` is the number of episodes. Cancels the
         evaluation when the caller stops before its end. Raises RefusedError when somebody else cancels it.
         """
-        started = await self._ask("evaluate", message, EvaluationStarted)
+        started = await self._ask("evaluate", message, ops.EvaluationStarted)
         token, name = self._token, started.evaluation
         cursor, finished = 0, False
         try:
             while not finished:
-                poll = EvaluationPoll(token=token, evaluation=name, cursor=cursor, wait_s=WAIT_S)
-                page = await self._requests.until_answered("poll", poll, EvaluationPage, wait_s=WAIT_S)
+                poll = ops.EvaluationPoll(token=token, evaluation=name, cursor=cursor, wait_s=WAIT_S)
+                page = await self._requests.until_answered("poll", poll, ops.EvaluationPage, wait_s=WAIT_S)
                 cursor, finished = page.cursor, page.finished
                 for outcome in page.outcomes:
                     yield outcome, page.total, ""
@@ -194,7 +167,7 @@ class OperatorClient:
         finally:
             if not finished:
                 with contextlib.suppress(EvopolicyError):
-                    await self._requests.once("cancel", CancelRun(token=token, run=name), Done)
+                    await self._requests.once("cancel", ops.CancelRun(token=token, run=name), ops.Done)
 
     # Blobs.
 

@@ -48,9 +48,7 @@ class Requester(Generic[Reply]):
         self, link: Link, key_of: Callable[[str], str], replies: msgspec.msgpack.Decoder[Reply]
     ) -> None:
         """`key_of` maps a verb (`lease`, `submit`) to the full key; `replies` decodes this kind of client's replies."""
-        self._link = link
-        self._key_of = key_of
-        self._replies = replies
+        self._link, self._key_of, self._replies = link, key_of, replies
 
     async def once(self, verb: str, message: Message, wanted: type[Wanted], *, wait_s: float = 0.0) -> Wanted:
         """Sends the message once and returns the reply.
@@ -88,23 +86,16 @@ class Requester(Generic[Reply]):
             pause = min(LONGEST_PAUSE_S, pause * 2)
 
     async def upload(self, sender: str, token: str, digest: str, data: bytes) -> None:
-        """Uploads a blob in acknowledged chunks; chunks that the coordinator already has are skipped.
-
-        Raises ProtocolError when the blob is too large.
-        """
+        """Uploads a blob in acknowledged chunks. Raises ProtocolError when it is too large."""
         if len(data) > codec.MAX_BLOB_BYTES:
             raise ProtocolError(f"a blob of {len(data):,} bytes; {codec.MAX_BLOB_BYTES:,} are the limit")
         offset = 0
         while True:
-            chunk = data[offset : offset + codec.CHUNK_BYTES]
-            ack = await self.until_answered(
-                "blob",
-                BlobPut(sender=sender, token=token, digest=digest, size=len(data), offset=offset, data=chunk),
-                BlobAck,
-            )
-            if ack.have >= len(data):
+            chunk, size = data[offset : offset + codec.CHUNK_BYTES], len(data)
+            put = BlobPut(sender=sender, token=token, digest=digest, size=size, offset=offset, data=chunk)
+            offset = (await self.until_answered("blob", put, BlobAck)).have
+            if offset >= size:
                 return
-            offset = ack.have
 
     async def download(self, sender: str, token: str, digest: str, most: int = codec.MAX_BLOB_BYTES) -> bytes:
         """Returns a blob of at most `most` bytes. Raises ProtocolError as `download_to`."""
@@ -115,13 +106,11 @@ class Requester(Generic[Reply]):
     async def download_to(
         self, file: IO[bytes], sender: str, token: str, digest: str, most: int = codec.MAX_BLOB_BYTES
     ) -> None:
-        """Writes a blob of at most `most` bytes to a file. Raises ProtocolError when it does not match its digest or is
-        too large."""
+        """Writes a blob to a file. Raises ProtocolError for more than `most` bytes, or another digest."""
         hashed, have = hashlib.sha256(), 0
         while True:
-            chunk = await self.until_answered(
-                "blob", BlobGet(sender=sender, token=token, digest=digest, offset=have), BlobChunk
-            )
+            get = BlobGet(sender=sender, token=token, digest=digest, offset=have)
+            chunk = await self.until_answered("blob", get, BlobChunk)
             if chunk.size > most:
                 raise ProtocolError(f"blob {digest} of {chunk.size:,} bytes; {most:,} are the limit")
             file.write(chunk.data)

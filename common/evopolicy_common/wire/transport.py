@@ -4,7 +4,7 @@ Rules that this module owns:
 - Zenoh's callbacks run on its threads and only pass work to the event loop.
 - Nothing is sent from the event loop: a send to a frozen peer blocks for seconds, and would expire all leases.
 - Every declaration is held by an object, since dropping it undeclares it.
-- Scouting is off and the admin space is closed; `_access_control` below grants the rights.
+- Scouting is off and the admin space is closed; `access_control` below grants the rights.
 - Machines connect over mutual TLS: each has a certificate, a user name and a password of its own. It has rights only if
   the certificate's common name and the user name both equal its identity.
 - No process forks while it has a session open.
@@ -33,7 +33,7 @@ from evopolicy_common.errors import ConfigError, TransportError
 from evopolicy_common.logs import structlog
 from evopolicy_common.processes.notices import notify_if_slow
 from evopolicy_common.wire import keys
-from evopolicy_common.wire.credentials import Credentials, MachineRole, Role, TlsFiles, check_endpoints
+from evopolicy_common.wire.credentials import Credentials, MachineRole, TlsFiles, check_endpoints
 
 log: structlog.stdlib.BoundLogger = structlog.get_logger()
 
@@ -45,6 +45,9 @@ RENEWED_LOOK_S = 2.0
 _RENEWED_PAUSE_S = 0.1
 STUCK_S = 2.0
 """Delay after a query's timeout at which the session is considered stuck, seconds."""
+
+
+_Lane = queue.SimpleQueue[tuple[zenoh.Query, str, bytes] | None]
 
 
 class IncomingQuery:
@@ -64,7 +67,7 @@ class IncomingQuery:
         """Sends the reply, off the event loop. Replies of one lane keep their order; a stalled peer stalls its lane."""
         query, self._query = self._query, None
         if query is not None:
-            self._server.send(lane, query, self.key, payload)
+            self._server.lanes[lane % _REPLY_LANES].put((query, self.key, payload))
 
     def drop(self) -> None:
         """Ends the query without a reply; the client is notified at once."""
@@ -89,11 +92,10 @@ class Server:
         self._scheduled = False
         self._lock = threading.Lock()
         self._held: list[Any] = []
-        self._lanes: list[queue.SimpleQueue[tuple[zenoh.Query, str, bytes] | None]] = []
-        for index in range(_REPLY_LANES):
-            lane: queue.SimpleQueue[tuple[zenoh.Query, str, bytes] | None] = queue.SimpleQueue()
+        self.lanes: list[_Lane] = [queue.SimpleQueue() for _ in range(_REPLY_LANES)]
+        """Replies, each sent by the thread of its lane; the event loop never sends."""
+        for index, lane in enumerate(self.lanes):
             threading.Thread(target=_send_replies, args=(lane,), name=f"reply-{index}", daemon=True).start()
-            self._lanes.append(lane)
 
     def declare(self, expressions: Iterable[str]) -> None:
         """Starts answering queries on these key expressions."""
@@ -109,13 +111,9 @@ class Server:
 
         self._held.append(self._session.liveliness().declare_subscriber(expression, changed, history=True))
 
-    def send(self, lane: int, query: zenoh.Query, key: str, payload: bytes) -> None:
-        """Sends a reply from the thread of its lane; the event loop never sends."""
-        self._lanes[lane % _REPLY_LANES].put((query, key, payload))
-
     def close(self) -> None:
         """Stops accepting queries. Replies waiting in a lane may be lost; clients send their requests again."""
-        for lane in self._lanes:
+        for lane in self.lanes:
             lane.put(None)
         self._held.clear()
         _close(self._session)
@@ -148,9 +146,7 @@ class Link:
         read_again: Callable[[], Credentials] | None = None,
     ) -> None:
         """`read_again`: as for `connect`."""
-        self.credentials = credentials
-        self._read_again = read_again
-        self._session = session
+        self.credentials, self._read_again, self._session = credentials, read_again, session
         self._sender = ThreadPoolExecutor(max_workers=4, thread_name_prefix="ask")
         self._alive: dict[str, Any] = {}
 
@@ -173,18 +169,19 @@ class Link:
             if not future.done():
                 future.set_result(value)
 
+        def post(value: bytes | None) -> None:
+            with contextlib.suppress(RuntimeError):  # the loop is closed: nobody waits any more
+                loop.call_soon_threadsafe(settle, value)
+
         def on_reply(reply: zenoh.Reply) -> None:
             if reply.ok is not None:
-                _post(loop, settle, bytes(reply.ok.payload))
-
-        def on_drop() -> None:
-            _post(loop, settle, None)
+                post(bytes(reply.ok.payload))
 
         send = partial(
             self._session.get,
             key,
             # On Zenoh's own thread, which waits for nothing here: an indirect callback starts a thread for each query.
-            zenoh.handlers.Callback(on_reply, on_drop, indirect=False),
+            zenoh.handlers.Callback(on_reply, partial(post, None), indirect=False),
             payload=payload,
             timeout=timeout_s,
             congestion_control=zenoh.CongestionControl.BLOCK,
@@ -220,8 +217,7 @@ class Link:
         self._alive[key] = self._session.liveliness().declare_token(key)
 
     async def renewed(self, token: str) -> bool:
-        """Whether the credentials have been renewed since they had this token. Waits for a session with those that are
-        on disk."""
+        """Whether the credentials no longer have this token. Waits for a session with those on disk."""
         while self.credentials.token == token:
             try:
                 fresh = None if self._read_again is None else await asyncio.to_thread(self._read_again)
@@ -233,8 +229,7 @@ class Link:
         return True
 
     def replace(self, session: zenoh.Session, credentials: Credentials) -> None:
-        """Goes on with another session. Open requests get no reply, and are sent again. Blocks until the old one is
-        closed."""
+        """Changes to another session; open requests are sent again. Blocks until the old one is closed."""
         old, self._session, self.credentials = self._session, session, credentials
         for key in self._alive:
             self.declare_alive(key)
@@ -278,8 +273,7 @@ async def connect(
 
 
 async def _take_renewed(link: Link, read_again: Callable[[], Credentials]) -> None:
-    """Looks whether the credentials have been renewed. Zenoh reads certificates and password only when it opens a
-    session."""
+    """Renews the session with renewed credentials, which Zenoh reads only when it opens a session."""
     used = _content(link.credentials)
     while True:
         await asyncio.sleep(RENEWED_LOOK_S)
@@ -341,61 +335,24 @@ def client_config(credentials: Credentials) -> zenoh.Config:
 
 
 def server_config(
-    cluster: str, listen: Iterable[str], passwords: Path, users: dict[Role, str]
-) -> zenoh.Config:
-    """The configuration of the coordinator's session for its own machine: a router that admits the users in
-    `passwords`.
-
-    `passwords` is a file with one line `user:password` each; `users` maps each role to its user name, and roles have
-    rights.
-    """
-    subjects = [{"id": role, "usernames": [user]} for role, user in users.items()]
-    rights = _access_control(cluster, subjects, [(role, role) for role in users])
-    return _config(_router(listen, passwords, rights))
-
-
-def tls_server_config(
     cluster: str,
     listen: Iterable[str],
     passwords: Path,
-    machines: Iterable[tuple[MachineRole, str]],
-    tls: TlsFiles,
+    users: Iterable[tuple[MachineRole, str]],
+    tls: TlsFiles | None = None,
 ) -> zenoh.Config:
-    """The configuration of the coordinator's session for other machines, over mutual TLS.
+    """The configuration of the coordinator's session for its own machine or, with `tls`, for other machines.
 
-    `machines` are roles and identities: common names of certificates and, as user names, entries of the file
-    `passwords`.
+    `users`: roles, which have rights, and user names. `passwords`: a file with a line `user:password` for each.
     """
-    rights = machine_access_control(cluster, machines)
-    return _config({**_router(listen, passwords, rights), **_tls(tls, "listen")})
-
-
-def machine_access_control(
-    cluster: str, machines: Iterable[tuple[MachineRole, str]], uplink: str | None = None
-) -> dict[str, Any]:
-    """The access rules over TLS: each machine has one name, in its certificate and as its user name.
-
-    A `router` is a site's own `zenohd`, which speaks for all roles behind it and has to apply these rules to them.
-    `uplink`: the common name of the peer that such a router connects to; requests go there and replies come from it.
-    """
-    listed = list(machines)
-    subjects = [
-        {"id": name, "usernames": [name], "cert_common_names": [name], "link_protocols": ["tls"]}
-        for _, name in listed
-    ]
-    rights = _access_control(cluster, subjects, [(name, role) for role, name in listed])
-    if uplink is not None:
-        opposite = {"ingress": "egress", "egress": "ingress"}
-        mirrored = [
-            {**rule, "id": f"{rule['id']}_above", "flows": [opposite[flow] for flow in rule["flows"]]}
-            for rule in rights["rules"]
-        ]
-        # The peer that a router connects to sends no user name; only its certificate identifies it.
-        above = {"id": "uplink", "cert_common_names": [uplink], "link_protocols": ["tls"]}
-        rights["subjects"].append(above)
-        rights["policies"].append({"subjects": ["uplink"], "rules": [rule["id"] for rule in mirrored]})
-        rights["rules"] += mirrored
-    return rights
+    settings = {
+        **_COMMON,
+        "mode": "router",
+        "listen/endpoints": list(listen),
+        "transport/auth/usrpwd/dictionary_file": str(passwords),
+        "access_control": access_control(cluster, users, tls=tls is not None),
+    }
+    return _config(settings | _tls(tls, "listen"))
 
 
 def site_router_settings(
@@ -409,10 +366,8 @@ def site_router_settings(
     user: str,
     password: str,
 ) -> dict[str, Any]:
-    """The configuration of a site's `zenohd`, by key: the coordinator's rules for its `machines`, and one uplink.
-
-    `user` and `password` are its own; `passwords` and the files of `tls` are paths on its host.
-    """
+    """The configuration of a site's `zenohd`, by key: the coordinator's rules for its `machines`, and one
+    uplink. `user` and `password` are its own; `passwords` and the files of `tls` are paths on its host."""
     return {
         **_COMMON,
         "mode": "router",
@@ -423,17 +378,19 @@ def site_router_settings(
         "transport/auth/usrpwd": {"user": user, "password": password, "dictionary_file": str(passwords)},
         **_tls(tls, "listen"),
         **_tls(tls, "connect"),
-        "access_control": machine_access_control(cluster, machines, uplink),
+        "access_control": access_control(cluster, machines, uplink),
     }
 
 
-def _access_control(
-    cluster: str, subjects: list[dict[str, Any]], roles: list[tuple[str, MachineRole]]
+def access_control(
+    cluster: str, users: Iterable[tuple[MachineRole, str]], uplink: str | None = None, *, tls: bool = True
 ) -> dict[str, Any]:
     """Zenoh's access rules: each role sends requests on its own keys and receives the replies, nothing else.
+    `declare_queryable` goes out to clients only: else one gateway could answer another's queries.
 
-    `declare_queryable` goes out to clients only: if it were accepted from them, one gateway could answer
-    another's queries.
+    With `tls` a machine's name is also that in its certificate. A `router` is a site's own `zenohd`, which speaks for
+    all roles behind it and has to apply these rules to them. `uplink`: the common name of the peer that such a router
+    connects to; requests go there and replies come from it.
     """
     rules: list[dict[str, Any]] = []
     granted: dict[MachineRole, list[str]] = {}
@@ -448,22 +405,27 @@ def _access_control(
         allow(role, f"{role}_asks", ["query"], "ingress", expression)
         allow(role, f"{role}_hears", ["reply", "declare_queryable"], "egress", expression)
     allow("worker", "worker_lives", ["liveliness_token"], "ingress", keys.liveliness_key(cluster, "*"))
+    subjects: list[dict[str, Any]] = []
+    policies: list[dict[str, Any]] = []
+    for machine_role, name in users:
+        over_tls = {"cert_common_names": [name], "link_protocols": ["tls"]} if tls else {}
+        subjects.append({"id": name, "usernames": [name], **over_tls})
+        policies.append({"subjects": [name], "rules": granted[machine_role]})
+    if uplink is not None:
+        opposite = {"ingress": ["egress"], "egress": ["ingress"]}
+        mirrored = [
+            {**rule, "id": f"{rule['id']}_above", "flows": opposite[rule["flows"][0]]} for rule in rules
+        ]
+        # The peer that a router connects to sends no user name; only its certificate identifies it.
+        subjects.append({"id": "uplink", "cert_common_names": [uplink], "link_protocols": ["tls"]})
+        policies.append({"subjects": ["uplink"], "rules": [rule["id"] for rule in mirrored]})
+        rules += mirrored
     return {
         "enabled": True,
         "default_permission": "deny",
         "rules": rules,
         "subjects": subjects,
-        "policies": [{"subjects": [subject], "rules": granted[role]} for subject, role in roles],
-    }
-
-
-def _router(listen: Iterable[str], passwords: Path, rights: dict[str, Any]) -> dict[str, Any]:
-    return {
-        **_COMMON,
-        "mode": "router",
-        "listen/endpoints": list(listen),
-        "transport/auth/usrpwd/dictionary_file": str(passwords),
-        "access_control": rights,
+        "policies": policies,
     }
 
 
@@ -537,12 +499,7 @@ def _doubt_of(credentials: Credentials) -> str:
     return f"are these credentials in its `certs list` ({credentials.user}), neither expired nor revoked?"
 
 
-def _post(loop: asyncio.AbstractEventLoop, call: Callable[[bytes | None], None], value: bytes | None) -> None:
-    with contextlib.suppress(RuntimeError):  # the loop is closed: nobody waits any more
-        loop.call_soon_threadsafe(call, value)
-
-
-def _send_replies(lane: queue.SimpleQueue[tuple[zenoh.Query, str, bytes] | None]) -> None:
+def _send_replies(lane: _Lane) -> None:
     while (item := lane.get()) is not None:
         query, key, payload = item
         try:

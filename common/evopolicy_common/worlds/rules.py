@@ -58,11 +58,11 @@ class Draws:
 
     def order(self, n: int) -> list[int]:
         """A permutation of `range(n)`."""
-        found = list(range(n))
+        numbers = list(range(n))
         for i in range(n - 1, 0, -1):
             j = self.below(i + 1)
-            found[i], found[j] = found[j], found[i]
-        return found
+            numbers[i], numbers[j] = numbers[j], numbers[i]
+        return numbers
 
 
 class _Vector(NamedTuple):
@@ -79,9 +79,9 @@ class _Vector(NamedTuple):
         return np.asarray(np.clip(changed, self.low, self.high), values.dtype)
 
     def undo(self, values: NDArray[Any]) -> NDArray[Any]:
-        found = np.empty_like(values)
-        found[self.order] = (values - self.shift) / self.scale
-        return np.asarray(np.clip(found, self.low, self.high), values.dtype)
+        undone = np.empty_like(values)
+        undone[self.order] = (values - self.shift) / self.scale
+        return np.asarray(np.clip(undone, self.low, self.high), values.dtype)
 
 
 class Rules:
@@ -151,19 +151,19 @@ class Rules:
 
 def kinds(obs_space: Space, action_space: Space, parameters: Sequence[str] = ()) -> list[str]:
     """The kinds of change that these spaces and parameters allow, keys of `TEXTS`."""
-    found = []
+    possible = []
     for space, what in ((action_space, "the actions"), (obs_space, "the observation")):
         if space["type"] == "Discrete" and space["n"] > 1 and not space.get("start", 0):
-            found.append(f"the order of {what}")
+            possible.append(f"the order of {what}")
         elif space["type"] == "Box" and len(space["shape"]) == 1 and np.dtype(space["dtype"]).kind == "f":
             low, high = _bounds(space)
             if any(len(group) > 1 for group in _groups(low, high)):
-                found.append(f"the order of {what}")
+                possible.append(f"the order of {what}")
             if (np.isinf(low) == np.isinf(high)).any():
-                found.append(f"the direction of {what}")
+                possible.append(f"the direction of {what}")
             if what == "the observation" and (np.isinf(low) & np.isinf(high)).any():
-                found.append(f"the scale of {what}")
-    return [*found, PARAMETERS] if parameters else found
+                possible.append(f"the scale of {what}")
+    return [*possible, PARAMETERS] if parameters else possible
 
 
 def text(possible: list[str], parameters: Sequence[str] = ()) -> str:
@@ -180,10 +180,10 @@ def text(possible: list[str], parameters: Sequence[str] = ()) -> str:
 
 def _groups(low: NDArray[np.float64], high: NDArray[np.float64]) -> list[list[int]]:
     """Places with the same bounds."""
-    found: dict[tuple[float, float], list[int]] = {}
+    groups: dict[tuple[float, float], list[int]] = {}
     for place, pair in enumerate(zip(low.tolist(), high.tolist(), strict=True)):
-        found.setdefault(pair, []).append(place)
-    return list(found.values())
+        groups.setdefault(pair, []).append(place)
+    return list(groups.values())
 
 
 def _within_groups(draws: Draws, groups: list[list[int]], n: int) -> list[int]:
@@ -197,9 +197,9 @@ def _within_groups(draws: Draws, groups: list[list[int]], n: int) -> list[int]:
 def _really(draw: Callable[[], list[int]], not_: list[int] | None = None) -> list[int]:
     """The first draw that changes something: not the numbers in order, or not `not_`."""
     while True:
-        found = draw()
-        if found != (list(range(len(found))) if not_ is None else not_):
-            return found
+        drawn = draw()
+        if drawn != (list(range(len(drawn))) if not_ is None else not_):
+            return drawn
 
 
 def _apply(change: list[int] | _Vector | None, value: Any) -> Any:

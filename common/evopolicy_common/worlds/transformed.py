@@ -1,5 +1,4 @@
-"""A policy for the unchanged environment, transformed for a world: code around it that undoes the altered
-rules."""
+"""A policy for the unchanged environment, with code around it that undoes a world's rules."""
 
 from __future__ import annotations
 
@@ -42,8 +41,7 @@ class Policy(Unchanged):
 
 
 def transformed(bundle: Bundle, rules: Rules) -> Bundle:
-    """The bundle that plays in a world as `bundle` does in the unchanged environment. It tells the world's
-    rules: keep it as secret as they are."""
+    """The bundle that plays in a world as `bundle` does outside. As secret as the rules."""
     around = _AROUND.format(
         inner=_INNER, observation=_literal(rules.obs_change), action=_literal(rules.action_change)
     )
@@ -58,7 +56,7 @@ def varied(bundle: Bundle, n: int) -> Bundle:
     """Variant `n` of a policy: each constant at the top of policy.py has its floating-point numbers
     multiplied by one factor, drawn for this variant. Variant 0 is the policy itself."""
     draws = Draws(f"variant {n}")
-    found = []
+    files = []
     for each in bundle.files if n else ():
         if each.path == "policy.py":
             tree = ast.parse(each.data)
@@ -66,8 +64,8 @@ def varied(bundle: Bundle, n: int) -> Bundle:
                 if isinstance(node, ast.Assign | ast.AnnAssign):
                     _Multiplied(FACTORS[draws.below(len(FACTORS))] ** 0.5).visit(node)
             each = BundleFile(each.path, each.executable, ast.unparse(tree).encode())
-        found.append(each)
-    return pack(found) if n else bundle
+        files.append(each)
+    return pack(files) if n else bundle
 
 
 class _Multiplied(ast.NodeTransformer):

@@ -16,8 +16,7 @@ from evopolicy_common.cli.frame import App, Version, run_app
 from evopolicy_common.processes.packages import checked_names
 from evopolicy_common.records.blobs import announcing
 from evopolicy_common.terminal import counted, say, say_json
-from evopolicy_common.wire.credentials import default_state_dir
-from evopolicy_common.wire.ready import Ready
+from evopolicy_common.wire.credentials import Ready, default_state_dir
 from evopolicy_coordinator.cli import certs as certs_cli
 from evopolicy_coordinator.cli import epochs as epochs_cli
 from evopolicy_coordinator.cli import router_config

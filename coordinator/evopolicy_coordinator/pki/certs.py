@@ -66,11 +66,9 @@ def make_authority(cluster: str, now: dt.datetime, days: int = AUTHORITY_DAYS) -
 def issue(
     authority: Pair, common_name: str, now: dt.datetime, days: int, *, hosts: Sequence[str] = (), serves: bool
 ) -> Pair:
-    """Issues a certificate with a new key, signed by `authority`.
-
-    `hosts`: DNS names and IP addresses that clients dial; required when it `serves`. Raises ConfigError for an
-    invalid name, or a validity beyond the authority's own.
-    """
+    """Issues a certificate with a new key, signed by `authority`. `hosts`: DNS names and IP addresses that
+    clients dial; required when it `serves`. Raises ConfigError for an invalid name, or a validity beyond the
+    authority's own."""
     parent = x509.load_pem_x509_certificate(authority.certificate)
     if now + dt.timedelta(days=days) > parent.not_valid_after_utc:
         raise ConfigError(
@@ -82,9 +80,7 @@ def issue(
     signer = serialization.load_pem_private_key(authority.private_key, password=None)
     assert isinstance(signer, ec.EllipticCurvePrivateKey)
     key = ec.generate_private_key(ec.SECP256R1())
-    usages = [ExtendedKeyUsageOID.CLIENT_AUTH]
-    if serves:
-        usages.append(ExtendedKeyUsageOID.SERVER_AUTH)
+    usages = [ExtendedKeyUsageOID.CLIENT_AUTH] + ([ExtendedKeyUsageOID.SERVER_AUTH] if serves else [])
     builder = (
         _builder(_name(common_name), parent.subject, key.public_key(), now, days)
         .add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
@@ -104,13 +100,13 @@ def describe(certificate: bytes) -> Described:
     """Parses a PEM certificate. Raises ConfigError when it is not one."""
     try:
         parsed = x509.load_pem_x509_certificate(certificate)
-        return Described(
-            serial=f"{parsed.serial_number:x}",
-            expires=parsed.not_valid_after_utc,
-            hosts=_hosts(parsed),
-        )
+        names = parsed.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
+        hosts = tuple(str(name.value) for name in names)
+    except x509.ExtensionNotFound:
+        hosts = ()
     except ValueError as error:
         raise ConfigError(f"not a certificate in PEM form: {error}") from error
+    return Described(serial=f"{parsed.serial_number:x}", expires=parsed.not_valid_after_utc, hosts=hosts)
 
 
 def check_hosts(hosts: Sequence[str]) -> None:
@@ -127,14 +123,6 @@ def _general_name(host: str) -> x509.GeneralName:
     if not _HOST_NAME.fullmatch(host) or len(host) > 253 or re.fullmatch(r"[0-9.]+", host):
         raise ConfigError(f"--host {host!r}: a DNS name or an IP address, without protocol or port")
     return x509.DNSName(host)
-
-
-def _hosts(certificate: x509.Certificate) -> tuple[str, ...]:
-    try:
-        names = certificate.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
-    except x509.ExtensionNotFound:
-        return ()
-    return tuple(str(name.value) for name in names)
 
 
 def _name(common_name: str) -> x509.Name:
@@ -156,16 +144,16 @@ def _builder(
 
 
 def _key_usage(*, signs_certificates: bool) -> x509.KeyUsage:
+    others = dict.fromkeys(
+        ("content_commitment", "key_encipherment", "data_encipherment", "key_agreement"), False
+    )
     return x509.KeyUsage(
         digital_signature=not signs_certificates,
-        content_commitment=False,
-        key_encipherment=False,
-        data_encipherment=False,
-        key_agreement=False,
         key_cert_sign=signs_certificates,
         crl_sign=signs_certificates,
         encipher_only=False,
         decipher_only=False,
+        **others,
     )
 
 

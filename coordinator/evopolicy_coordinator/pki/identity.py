@@ -18,22 +18,12 @@ SIGNING_KEY = "signing-key"
 
 
 def public_key(state: Path) -> str:
-    """The public key, 64 hex digits. Creates the key on first use.
-
-    Raises ConfigError when the key's file is damaged, or others may read it.
-    """
-    return _public(_private(state))
+    """The public key, 64 hex digits. Creates the key on first use. Raises ConfigError as `load_or_create_secret`."""
+    return sign(state, "")[0]
 
 
 def sign(state: Path, digest: str, kind: bytes = MANIFEST) -> tuple[str, str]:
     """Signs a SHA-256 (hex). Returns the public key (64 hex digits) and the signature (128)."""
-    key = _private(state)
-    return _public(key), key.sign(kind + bytes.fromhex(digest)).hex()
-
-
-def _private(state: Path) -> Ed25519PrivateKey:
-    return Ed25519PrivateKey.from_private_bytes(load_or_create_secret(state / SIGNING_KEY))
-
-
-def _public(key: Ed25519PrivateKey) -> str:
-    return key.public_key().public_bytes(Encoding.Raw, PublicFormat.Raw).hex()
+    key = Ed25519PrivateKey.from_private_bytes(load_or_create_secret(state / SIGNING_KEY))
+    public = key.public_key().public_bytes(Encoding.Raw, PublicFormat.Raw).hex()
+    return public, key.sign(kind + bytes.fromhex(digest)).hex()

@@ -101,15 +101,9 @@ class Machines:
 
     def holder(self, role: Role, token: str) -> Machine | None:
         """The admitted machine of this role with this token; compared in constant time."""
-        newest = None
-        for machine in self.admitted():
-            if (
-                machine.role == role
-                and machine.token
-                and hmac.compare_digest(machine.token.encode(), token.encode())
-            ):
-                newest = machine
-        return newest
+        mine = [machine for machine in self.admitted() if machine.role == role and machine.token]
+        same = [each for each in mine if hmac.compare_digest(each.token.encode(), token.encode())]
+        return same[-1] if same else None
 
     def session_for(self, token: str) -> str:
         """A new session for a worker that registers; it names the machine's certificate if the token is a machine's."""
@@ -152,10 +146,8 @@ def write_passwords(path: Path, admitted: Iterable[Machine]) -> None:
 def init(
     state: Path, cluster: str, hosts: tuple[str, ...], now: dt.datetime, days: int, *, anew: bool
 ) -> None:
-    """Creates the coordinator's certificate, and the authority if it is missing or `anew`.
-
-    A new authority invalidates and removes all machines of the old one.
-    """
+    """Makes the coordinator's certificate, and the authority if missing or `anew`, which removes all
+    machines."""
     (state / "certs").mkdir(mode=0o700, exist_ok=True)
     with _changing(state) as folder:
         kept = not anew and (folder / "ca-key.pem").exists()

@@ -19,6 +19,7 @@ from evopolicy_common.records.episodes.rendered import decode
 from evopolicy_common.records.episodes.trajectory import Trajectory
 from evopolicy_coordinator.core.contract.effects import AuditEffect, CompareAudit
 from evopolicy_coordinator.core.contract.events import AuditCompared, AuditEvent, AuditPrepared
+from evopolicy_coordinator.core.contract.records import OutcomeRow
 from evopolicy_coordinator.storage.store import Reader
 
 MAX_TEXT = 500
@@ -88,7 +89,7 @@ def _actions(recorded: Trajectory) -> bytes:
 
 
 def _outcome(reader: Reader, group: str, index: int) -> EpisodeOutcome:
-    row = reader.outcome(group, index)
+    row = reader.one(OutcomeRow, grp=group, idx=index)
     if row is None:
         raise StorageError(f"there is no outcome {index} of {group}")
     return row.outcome

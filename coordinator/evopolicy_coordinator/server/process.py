@@ -20,7 +20,7 @@ from evopolicy_common.processes import host
 from evopolicy_common.records.blobs import BlobStore
 from evopolicy_common.simulators import SIMULATORS
 from evopolicy_common.wire import credentials, transport
-from evopolicy_common.wire.ready import Ready
+from evopolicy_common.wire.credentials import Ready
 from evopolicy_coordinator.core.contract.settings import CoreSettings
 from evopolicy_coordinator.pki.machines import Machines
 from evopolicy_coordinator.server.definitions import Definitions
@@ -117,7 +117,7 @@ async def run(options: Options, stop: asyncio.Event, on_ready: Callable[[Ready],
         state.write_passwords()
         endpoints = reachable(listen)
         files = state.write_credentials(endpoints, insecure_tcp=options.insecure_tcp)
-        config = transport.server_config(cluster, listen, state.passwords, {role: role for role in ROLES})
+        config = transport.server_config(cluster, listen, state.passwords, [(role, role) for role in ROLES])
         server = await opened.enter_async_context(transport.serve(config, queries))
         # While the sessions are still open: handled queries get their replies, all others are dropped.
         opened.push_async_callback(service.stop)

@@ -44,7 +44,14 @@ from evopolicy_common.wire.transport import IncomingQuery
 from evopolicy_coordinator.core.contract import records
 from evopolicy_coordinator.core.contract.effects import AuditEffect, ReadEvaluation, ReadFinished, ReadResults
 from evopolicy_coordinator.core.contract.events import AuditEvent
-from evopolicy_coordinator.core.contract.records import JournalRow, OutcomeRow, RunRow, SubmitRow
+from evopolicy_coordinator.core.contract.records import (
+    DocumentRow,
+    JournalRow,
+    OutcomeRow,
+    RunRow,
+    RunStateRow,
+    SubmitRow,
+)
 from evopolicy_coordinator.pki import identity
 from evopolicy_coordinator.server.reason_texts import env_failure, operator_words, words
 from evopolicy_coordinator.server.uploads import Uploads
@@ -155,19 +162,20 @@ class ServiceReader:
 
     def finished_run(self, run: str) -> RunRow | None:
         """A finished run as it was created; None for any other run. Reads the database."""
-        return self._reader.run(run) if run and self._reader.finished(run) is not None else None
+        return self._reader.one(RunRow, run=run) if run and self._reader.finished(run) is not None else None
 
     def parent(self, start: Start) -> tuple[RunRow | None, SubmitRow | None, bool]:
         """The run and the submit that `start` names, None for an unknown one, and whether that run's agent has ended.
         Reads the database."""
-        submit = self._reader.submit(start.run, start.submit_index)
-        return self._reader.run(start.run), submit, self._reader.ended(start.run)
+        submit = self._reader.one(SubmitRow, run=start.run, submit_index=start.submit_index)
+        state = self._reader.one(RunStateRow, run=start.run)
+        return self._reader.one(RunRow, run=start.run), submit, state is not None and state.phase != "open"
 
     def replayed(self, run: str) -> RunRow | None:
         """The finished run that is to be played again; None for none and for an unknown one. Reads the database. Raises
         RefusedError for an open run."""
         finished = self.finished_run(run)
-        if run and finished is None and self._reader.run(run) is not None:
+        if run and finished is None and self._reader.one(RunRow, run=run) is not None:
             text = f"run {run[:64]} is open; only a finished run is replayed: wait until it is scored, or cancel it"
             raise RefusedError(Refusal.BUSY, text)
         return finished
@@ -228,7 +236,7 @@ class ServiceReader:
         return RunProgress(phase="finished", done=done, total=done, finished=finished)
 
     def _results(self, effect: ReadResults) -> Message:
-        row = self._reader.submit(effect.run, effect.submit_index)
+        row = self._reader.one(SubmitRow, run=effect.run, submit_index=effect.submit_index)
         if row is None:
             return Refused(
                 status=Refusal.UNKNOWN_SUBMIT, message=f"this run has no submit {effect.submit_index}"
@@ -283,15 +291,16 @@ class ServiceReader:
 
     def _opening(self, message: OpeningRequest) -> Message:
         row = self.finished_run(message.run)
-        opening = self._reader.document(message.run, "opening")
-        result = self._reader.document(message.run, "result")
+        opening, result = (
+            self._reader.one(DocumentRow, run=message.run, kind=kind) for kind in ("opening", "result")
+        )
         if row is None or opening is None or result is None:
             text = f"there is no finished run {message.run[:64]!r} here that was committed to"
             return Refused(status=Refusal.UNKNOWN_RUN, message=text)
         if row.epoch not in self._reader.revealed():
             text = f"the cases of run {row.run} are not disclosed; publish it first"
             return Refused(status=Refusal.BAD_REQUEST, message=text)
-        return RunOpening(salt=row.salt, opening=opening, result=result)
+        return RunOpening(salt=row.salt, opening=opening.data, result=result.data)
 
     def _sign(self, message: SignRequest) -> Message:
         if not is_digest(message.digest):

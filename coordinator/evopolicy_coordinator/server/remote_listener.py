@@ -61,7 +61,7 @@ async def remote_listener(
                     )
                 machines.write_passwords()
                 listed = [(machine.role, machine.identity) for machine in machines.admitted()]
-                config = transport.tls_server_config(cluster, listen, machines.passwords, listed, tls)
+                config = transport.server_config(cluster, listen, machines.passwords, listed, tls)
                 async with transport.serve(config, on_queries) as server:
                     declare_all(server, cluster, on_liveliness)
                     if opened.done():

@@ -23,20 +23,12 @@ from evopolicy_common.errors import ConfigError, StorageError
 from evopolicy_common.records.blobs import BlobStore, fsync_directory, write_atomically
 from evopolicy_common.wire.credentials import no_state
 from evopolicy_coordinator.pki.identity import SIGNING_KEY
+from evopolicy_coordinator.splits import SECRET, UNJAILED_SECRET
 from evopolicy_coordinator.storage.store import DATABASE
 from evopolicy_coordinator.worlds import JOURNAL
 
-KEPT_FILES = (
-    "secret",
-    "secret-unjailed",
-    "identity.json",
-    SIGNING_KEY,
-    JOURNAL,
-    *(
-        f"certs/{name}"
-        for name in ("ca.pem", "ca-key.pem", "coordinator.pem", "coordinator-key.pem", "machines.json")
-    ),
-)
+_CERTS = ("ca.pem", "ca-key.pem", "coordinator.pem", "coordinator-key.pem", "machines.json")
+KEPT_FILES = (SECRET, UNJAILED_SECRET, "identity.json", SIGNING_KEY, JOURNAL, *(f"certs/{n}" for n in _CERTS))
 """The cluster's identity, besides its database and blobs. A start creates everything else again."""
 
 
@@ -64,23 +56,21 @@ def back_up(state: Path, target: Path) -> Backup:
         if partial.exists():
             shutil.rmtree(partial)
         partial.mkdir(parents=True, mode=0o700)
-        copied = _copy(state, partial)
+        blobs, size = _copy(state, partial)
         os.replace(partial, target)
         fsync_directory(target.parent)
     except OSError as error:
-        shutil.rmtree(partial, ignore_errors=True)
         raise StorageError(f"cannot back up to {target}: {error.strerror or error}") from error
-    except BaseException:
+    finally:
         shutil.rmtree(partial, ignore_errors=True)
-        raise
-    return msgspec.structs.replace(copied, path=str(target))
+    return Backup(path=str(target), blobs=blobs, bytes=size)
 
 
-def _copy(state: Path, folder: Path) -> Backup:
+def _copy(state: Path, folder: Path) -> tuple[int, int]:
+    """Returns the number of blobs, and the bytes of database and blobs."""
     for name in KEPT_FILES:
-        with contextlib.suppress(
-            FileNotFoundError
-        ):  # splits from files need no secret, a single machine no certificates
+        # Splits from files need no secret, a single machine no certificates.
+        with contextlib.suppress(FileNotFoundError):
             data = (state / name).read_bytes()
             (folder / name).parent.mkdir(mode=0o700, exist_ok=True)
             write_atomically(folder / name, data, mode=0o600)
@@ -92,7 +82,7 @@ def _copy(state: Path, folder: Path) -> Backup:
         data = source.read(digest)
         blobs.put(data)
         count, total = count + 1, total + len(data)
-    return Backup(path=str(folder), blobs=count, bytes=total)
+    return count, total
 
 
 def _copy_database(source: Path, target: Path) -> None:

@@ -61,13 +61,13 @@ class Collected(msgspec.Struct, frozen=True, kw_only=True):
     """Free on the disk afterwards."""
 
 
-class EnvironmentUse(msgspec.Struct, frozen=True, kw_only=True):
+class EnvironmentUse(msgspec.Struct):
     """Disk use of the stored runs of one environment."""
 
     env: str
-    runs: int
-    train_episodes: int
-    bytes: int
+    runs: int = 0
+    train_episodes: int = 0
+    bytes: int = 0
     """Rows and blobs, including hidden episodes."""
 
     @property
@@ -101,13 +101,12 @@ def collect(
     with _database(state) as db:
         blobs = BlobStore(state / "blobs")
         old_runs = [row.run for row in rows(db, FinishedRow) if row.result.finished_at < now - older_than_s]
-        old_evaluations = [
-            row.evaluation
-            for row in rows(db, EvaluationRow, "WHERE finished")
-            if row.created_at < now - older_than_s
-        ]
-        gone = [_of_run(run) for run in old_runs]
-        gone += [_of_evaluation(evaluation) for evaluation in old_evaluations]
+        old = (
+            row for row in rows(db, EvaluationRow, "WHERE finished") if row.created_at < now - older_than_s
+        )
+        old_evaluations = [row.evaluation for row in old]
+        groups = [evaluation_group(evaluation) for evaluation in old_evaluations]
+        gone = [*map(_of_run, old_runs), *((group, f"{group}\0") for group in groups)]
         named = _named(db, frozenset(old_runs), frozenset(old_evaluations))
         sizes = [_size(db, bounds) for bounds in gone]
         unnamed = [
@@ -160,14 +159,10 @@ def use(state: Path) -> list[EnvironmentUse]:
             _, size = _size(db, _of_run(run.run))
             digests = db.execute("SELECT digest FROM train_blobs WHERE run = ?", (run.run,)).fetchall()
             size += sum(blobs.size(digest) for (digest,) in digests if blobs.has(digest))
-            env = run.settings.env
-            before = by_env.get(env) or EnvironmentUse(env=env, runs=0, train_episodes=0, bytes=0)
-            by_env[env] = EnvironmentUse(
-                env=env,
-                runs=before.runs + 1,
-                train_episodes=before.train_episodes + train,
-                bytes=before.bytes + size,
-            )
+            one = by_env.setdefault(run.settings.env, EnvironmentUse(run.settings.env))
+            one.runs += 1
+            one.train_episodes += train
+            one.bytes += size
     return sorted(by_env.values(), key=lambda each: -each.bytes)
 
 
@@ -201,11 +196,6 @@ def _of_run(run: str) -> Bounds:
     return f"{run}/", f"{run}0"  # "0" is the character after "/"
 
 
-def _of_evaluation(evaluation: str) -> Bounds:
-    group = evaluation_group(evaluation)
-    return group, f"{group}\0"
-
-
 def _size(db: sqlite3.Connection, bounds: Bounds) -> tuple[int, int]:
     """Number and bytes of the outcomes of these groups."""
     query = "SELECT COUNT(*), IFNULL(SUM(LENGTH(head) + LENGTH(data)), 0) FROM outcomes WHERE grp >= ? AND grp < ?"
@@ -214,28 +204,26 @@ def _size(db: sqlite3.Connection, bounds: Bounds) -> tuple[int, int]:
 
 
 def _delete(db: sqlite3.Connection, bounds: Bounds) -> None:
-    """Deletes a run's or an evaluation's rows in one short transaction, so that a running coordinator never waits
-    long."""
+    """Deletes these rows in one short transaction, so that a running coordinator never waits long."""
     db.execute("BEGIN IMMEDIATE")
     for table in ("outcomes", "strikes", "begun"):
         db.execute(f"DELETE FROM {table} WHERE grp >= ? AND grp < ?", bounds)
     db.execute("COMMIT")
 
 
-def _named(db: sqlite3.Connection, old_runs: frozenset[str], old_evaluations: frozenset[str]) -> set[str]:
+def _named(
+    db: sqlite3.Connection, old_runs: frozenset[str], old_evaluations: frozenset[str]
+) -> set[str | None]:
     """Digests of all blobs that the remaining rows name."""
-    named = {row.bundle for row in rows(db, SubmitRow) if row.bundle is not None and row.run not in old_runs}
+    named = {row.bundle for row in rows(db, SubmitRow) if row.run not in old_runs}
     for evaluation in rows(db, EvaluationRow):
         if evaluation.evaluation not in old_evaluations:
-            named.update(ref.digest for ref in evaluation.replays)
-            named.update(filter(None, (evaluation.bundle,)))
-    named |= {
-        digest for run, digest in db.execute("SELECT run, digest FROM train_blobs") if run not in old_runs
-    }
+            named |= {ref.digest for ref in evaluation.replays} | {evaluation.bundle}
+    train_blobs = db.execute("SELECT run, digest FROM train_blobs")
+    named |= {digest for run, digest in train_blobs if run not in old_runs}
     named |= {row.actions.digest for row in rows(db, AuditRow) if row.actions is not None}
     named |= {row.begun.digest for row in rows(db, BegunRow) if row.begun is not None}
-    hidden = "WHERE grp NOT LIKE '%/train'"
-    for row in rows(db, OutcomeRow, hidden):
+    for row in rows(db, OutcomeRow, "WHERE grp NOT LIKE '%/train'"):
         head, _, tail = row.group.partition("/")
         if head not in old_runs and not (head == "evaluation" and tail in old_evaluations):
             named |= {ref.digest for ref in stored_blobs(row.outcome)}
@@ -249,8 +237,7 @@ def _age_s(blobs: BlobStore, digest: str, now: float) -> float:
 
 
 def _shrink(state: Path, db: sqlite3.Connection) -> bool:
-    """Returns the file's free pages to the disk, unless a coordinator has the folder: it would have to wait
-    meanwhile."""
+    """Returns the file's free pages to the disk, unless a coordinator would have to wait for it."""
     try:
         fd = lock(state)
     except ConfigError:

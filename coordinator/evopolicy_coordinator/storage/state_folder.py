@@ -68,11 +68,9 @@ class StateFolder:
 
     @classmethod
     def open(cls, root: Path, cluster: str | None = None) -> StateFolder:
-        """Creates the folder if it is missing, locks it and reads its identity.
-
-        `cluster` None: the folder's own name, `local` for a new folder. Raises ConfigError when another coordinator
-        holds the lock, others may enter the folder, or it belongs to another cluster.
-        """
+        """Creates the folder if it is missing, locks it and reads its identity. `cluster` None: the folder's
+        own name, `local` for a new one. Raises ConfigError when another coordinator holds the lock, others
+        may enter the folder, or it belongs to another cluster."""
         root = Path(os.path.abspath(root))
         _make_private(root, cluster)
         lock_fd = lock(root)
@@ -84,10 +82,8 @@ class StateFolder:
 
     @property
     def socket_endpoint(self) -> str:
-        """The Zenoh endpoint inside the folder, through a link when its own path is too long for a unix socket.
-
-        The same after every restart. Raises ConfigError when there is no place for a link.
-        """
+        """The Zenoh endpoint inside the folder, the same after every restart: through a link when its own
+        path is too long for a unix socket. Raises ConfigError when there is no place for a link."""
         folder = self.root
         if not _fits(folder):
             folder = self._link = _linked(folder)
@@ -96,10 +92,8 @@ class StateFolder:
     def write_credentials(
         self, endpoints: tuple[str, ...], *, insecure_tcp: bool = False
     ) -> dict[Role, Path]:
-        """Writes the three roles' files for `endpoints` and returns their paths.
-
-        `insecure_tcp`: whether holders of these credentials may use plain `tcp/` beyond this machine.
-        """
+        """Writes the roles' files for `endpoints`, with `insecure_tcp` also for plain `tcp/`; returns their
+        paths."""
         tokens = {"worker": self.identity.worker_token, "operator": self.identity.operator_token}
         paths: dict[Role, Path] = {}
         for role in ROLES:
@@ -132,19 +126,14 @@ class StateFolder:
 
 
 def cluster_of(root: Path, cluster: str | None) -> str:
-    """Returns the name of a state folder's cluster, also while its coordinator runs.
-
-    Creates a missing folder, with the name `cluster`. Raises ConfigError in the same cases as `StateFolder.open`,
-    except for the lock.
-    """
+    """The name of a folder's cluster, `cluster` for a new one. Raises ConfigError as `StateFolder.open`."""
     _make_private(root, cluster)
     return _identity(root, cluster).cluster
 
 
 @contextlib.contextmanager
 def held(root: Path) -> Iterator[None]:
-    """The folder, created if it is missing, while no coordinator and no other command changes it. Raises
-    ConfigError as `StateFolder.open`."""
+    """The folder, locked against others. Raises ConfigError as `StateFolder.open`."""
     _make_private(root, None)
     lock_fd = lock(root)
     try:
@@ -268,10 +257,4 @@ def _free_port(endpoint: str, host: str) -> int:
 
 def reachable(endpoints: tuple[str, ...]) -> tuple[str, ...]:
     """The endpoints that processes of this machine can connect to: wildcard addresses become loopback addresses."""
-    wildcards = {"0.0.0.0": "127.0.0.1", "[::]": "[::1]"}
-    dialled = []
-    for endpoint in endpoints:
-        for wildcard, loopback in wildcards.items():
-            endpoint = endpoint.replace(f"/{wildcard}:", f"/{loopback}:")
-        dialled.append(endpoint)
-    return tuple(dialled)
+    return tuple(each.replace("/0.0.0.0:", "/127.0.0.1:").replace("/[::]:", "/[::1]:") for each in endpoints)

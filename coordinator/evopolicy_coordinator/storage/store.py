@@ -26,24 +26,6 @@ from evopolicy_common.errors import DECODE_ERRORS, ConfigError, DamagedStoreErro
 from evopolicy_common.messages.episode import BlobRef, EpisodeOutcome
 from evopolicy_common.messages.operator import RunFinished
 from evopolicy_coordinator.core.contract import records
-from evopolicy_coordinator.core.contract.records import (
-    AuditRow,
-    BegunRow,
-    DocumentRow,
-    EvaluationRow,
-    FinishedRow,
-    JournalRow,
-    KernelRow,
-    OutcomeHead,
-    OutcomeRow,
-    PermitRow,
-    Row,
-    RunRow,
-    RunStateRow,
-    Snapshot,
-    SubmitRow,
-    WorkerRow,
-)
 
 T = TypeVar("T")
 
@@ -120,20 +102,20 @@ class _Place(NamedTuple):
 
 
 _PLACES: dict[type[Any], _Place] = {
-    RunRow: _Place("runs", ("run",), ("key",)),
-    RunStateRow: _Place("run_states", ("run",), ("phase",)),
-    SubmitRow: _Place("submits", ("run", "submit_index"), ("key",)),
-    OutcomeRow: _Place("outcomes", ("grp", "idx"), ("seq", "head")),
-    OutcomeHead: _Place("outcomes", ("grp", "idx"), column="head"),
-    BegunRow: _Place("begun", ("grp", "first")),
-    EvaluationRow: _Place("evaluations", ("evaluation",), ("key", "finished")),
-    FinishedRow: _Place("finished", ("run",)),
-    WorkerRow: _Place("workers", ("worker",)),
-    AuditRow: _Place("audits", ("audit",), ("run",)),
-    PermitRow: _Place("permits", ("run", "boot_id"), ("ended",)),
-    KernelRow: _Place("kernels", ("worker",)),
-    JournalRow: _Place("journal", ("seq",), ("reveals",), replaced=False),
-    DocumentRow: _Place("documents", ("run", "kind"), replaced=False),
+    records.RunRow: _Place("runs", ("run",), ("key",)),
+    records.RunStateRow: _Place("run_states", ("run",), ("phase",)),
+    records.SubmitRow: _Place("submits", ("run", "submit_index"), ("key",)),
+    records.OutcomeRow: _Place("outcomes", ("grp", "idx"), ("seq", "head")),
+    records.OutcomeHead: _Place("outcomes", ("grp", "idx"), column="head"),
+    records.BegunRow: _Place("begun", ("grp", "first")),
+    records.EvaluationRow: _Place("evaluations", ("evaluation",), ("key", "finished")),
+    records.FinishedRow: _Place("finished", ("run",)),
+    records.WorkerRow: _Place("workers", ("worker",)),
+    records.AuditRow: _Place("audits", ("audit",), ("run",)),
+    records.PermitRow: _Place("permits", ("run", "boot_id"), ("ended",)),
+    records.KernelRow: _Place("kernels", ("worker",)),
+    records.JournalRow: _Place("journal", ("seq",), ("reveals",), replaced=False),
+    records.DocumentRow: _Place("documents", ("run", "kind"), replaced=False),
 }
 _VALUES: dict[str, Callable[[Any], object]] = {
     "grp": lambda row: row.group,
@@ -152,10 +134,7 @@ class Store:
     """The writing connection. Threads must not use it at the same time."""
 
     def __init__(self, path: Path) -> None:
-        """Opens or creates the database, and migrates an older one.
-
-        Raises ConfigError when the file is of a newer version or not a database, StorageError when the disk refuses.
-        """
+        """Opens, creates or migrates the database. Raises ConfigError for a newer version, StorageError."""
         self._path = path
         self._db = _connect(path)
         try:
@@ -178,7 +157,7 @@ class Store:
             script = f"BEGIN IMMEDIATE; {_MIGRATIONS[number]} PRAGMA user_version={number + 1}; COMMIT;"
             self._db.executescript(script)
 
-    def write(self, changed: Iterable[Row]) -> None:
+    def write(self, changed: Iterable[records.Row]) -> None:
         """Writes all rows in one durable transaction. Raises StorageError when it fails; then no row is stored."""
         with storage_errors(self._path), self._transaction():
             for row in changed:
@@ -199,7 +178,7 @@ class Store:
     def forget_kernels(self, boot_id: str) -> None:
         """Durably deletes the records of which workers were on that kernel: those workers are known to have ended."""
         with storage_errors(self._path), self._transaction():
-            for row in list(rows(self._db, KernelRow)):
+            for row in list(rows(self._db, records.KernelRow)):
                 if row.boot_id == boot_id:
                     self._db.execute("DELETE FROM kernels WHERE worker = ?", (row.worker,))
 
@@ -214,7 +193,7 @@ class Store:
         with storage_errors(self._path):
             return self._db.execute("SELECT suite, name, data FROM claims").fetchall()
 
-    def load(self) -> Snapshot:
+    def load(self) -> records.Snapshot:
         """Durably increments the incarnation, then reads the state that a core starts from."""
         with storage_errors(self._path):
             with self._transaction():
@@ -225,42 +204,43 @@ class Store:
             finally:
                 self._db.execute("ROLLBACK")
 
-    def _snapshot(self) -> Snapshot:
+    def _snapshot(self) -> records.Snapshot:
         db = self._db
         incarnation = db.execute("SELECT value FROM meta WHERE name = 'incarnation'").fetchone()[0]
         live_runs = "SELECT run FROM run_states WHERE phase != 'finished'"
-        submits = tuple(rows(db, SubmitRow, f"WHERE run IN ({live_runs})"))
-        evaluations = tuple(rows(db, EvaluationRow))
+        submits = tuple(rows(db, records.SubmitRow, f"WHERE run IN ({live_runs})"))
+        evaluations = tuple(rows(db, records.EvaluationRow))
         groups = [group(row.run, row.submit_index) for row in submits for group in records.GROUPS.values()]
         groups += [records.random_group(run) for (run,) in db.execute(live_runs)]
         groups += [records.evaluation_group(row.evaluation) for row in evaluations if not row.finished]
-        return Snapshot(
+        return records.Snapshot(
             incarnation=incarnation,
-            runs=tuple(rows(db, RunRow)),
-            states=tuple(rows(db, RunStateRow)),
+            runs=tuple(rows(db, records.RunRow)),
+            states=tuple(rows(db, records.RunStateRow)),
             submits=submits,
             outcomes=tuple(
                 head
                 for group in groups
-                for head in rows(db, OutcomeHead, "WHERE grp = ? ORDER BY seq", (group,))
+                for head in rows(db, records.OutcomeHead, "WHERE grp = ? ORDER BY seq", (group,))
             ),
-            begun=tuple(row for group in groups for row in rows(db, BegunRow, "WHERE grp = ?", (group,))),
+            begun=tuple(
+                row for group in groups for row in rows(db, records.BegunRow, "WHERE grp = ?", (group,))
+            ),
             evaluations=evaluations,
-            workers=tuple(rows(db, WorkerRow)),
-            audits=tuple(rows(db, AuditRow, f"WHERE run IN ({live_runs})")),
-            permits=tuple(rows(db, PermitRow, "WHERE NOT ended")),
-            kernels=tuple(rows(db, KernelRow)),
-            journal=next(rows(db, JournalRow, "ORDER BY seq DESC LIMIT 1"), None),
+            workers=tuple(rows(db, records.WorkerRow)),
+            audits=tuple(rows(db, records.AuditRow, f"WHERE run IN ({live_runs})")),
+            permits=tuple(rows(db, records.PermitRow, "WHERE NOT ended")),
+            kernels=tuple(rows(db, records.KernelRow)),
+            journal=next(rows(db, records.JournalRow, "ORDER BY seq DESC LIMIT 1"), None),
             revealed=tuple(revealed(db)),
         )
 
     def close(self) -> None:
         """Checkpoints the write-ahead log into the database if possible, and closes."""
-        try:
+        with contextlib.suppress(
+            sqlite3.Error
+        ):  # all is durable in the log, which the next start checkpoints
             self._db.execute("PRAGMA wal_checkpoint(TRUNCATE)")
-        except sqlite3.Error:
-            # Everything is durable in the log; the next start checkpoints it.
-            pass
         self._db.close()
 
 
@@ -271,61 +251,41 @@ class Reader:
         self._path = path
         self._db = _connect(path, read_only=True)
 
-    def outcomes(self, group: str, cursor: int, upto: int, max_bytes: int) -> tuple[OutcomeRow, ...]:
+    def outcomes(self, group: str, cursor: int, upto: int, max_bytes: int) -> tuple[records.OutcomeRow, ...]:
         """Outcomes with cursor ≤ seq < upto in order of `seq`, up to `max_bytes` of rows but at least one."""
         where = "WHERE grp = ? AND seq >= ? AND seq < ? ORDER BY seq"
-        return self._page(OutcomeRow, where, (group, cursor, upto), max_bytes)
+        return self._page(records.OutcomeRow, where, (group, cursor, upto), max_bytes)
 
-    def outcome(self, group: str, index: int) -> OutcomeRow | None:
-        """The outcome at `index` of its group; None when it is missing."""
-        return self._one(OutcomeRow, "WHERE grp = ? AND idx = ?", (group, index))
-
-    def submit(self, run: str, submit_index: int) -> SubmitRow | None:
-        """The submit's current row; None when it is missing."""
-        return self._one(SubmitRow, "WHERE run = ? AND submit_index = ?", (run, submit_index))
+    def one(self, kind: type[T], /, **key: object) -> T | None:
+        """The row of a kind with this key, by column; None when it is missing."""
+        where = " AND ".join(f"{column} = ?" for column in key)
+        with storage_errors(self._path):
+            return next(rows(self._db, kind, f"WHERE {where}", tuple(key.values())), None)
 
     def bundles(self, run: str) -> frozenset[str | None]:
         """The bundles that the run's submits name."""
         with storage_errors(self._path):
-            return frozenset(row.bundle for row in rows(self._db, SubmitRow, "WHERE run = ?", (run,)))
+            return frozenset(row.bundle for row in rows(self._db, records.SubmitRow, "WHERE run = ?", (run,)))
 
     def finished(self, run: str) -> RunFinished | None:
         """The result of a run; None while it is not finished."""
-        row = self._one(FinishedRow, "WHERE run = ?", (run,))
+        row = self.one(records.FinishedRow, run=run)
         return None if row is None else row.result
 
-    def run(self, run: str) -> RunRow | None:
-        """The run as it was created; None for an unknown one."""
-        return self._one(RunRow, "WHERE run = ?", (run,))
-
-    def ended(self, run: str) -> bool:
-        """Whether the agent of a run has ended."""
-        row = self._one(RunStateRow, "WHERE run = ?", (run,))
-        return row is not None and row.phase != "open"
-
-    def journal(self, cursor: int, max_bytes: int) -> tuple[JournalRow, ...]:
+    def journal(self, cursor: int, max_bytes: int) -> tuple[records.JournalRow, ...]:
         """Entries of the journal from `cursor` on, up to `max_bytes` but at least one; empty past the last entry."""
-        return self._page(JournalRow, "WHERE seq >= ? ORDER BY seq", (cursor,), max_bytes)
+        return self._page(records.JournalRow, "WHERE seq >= ? ORDER BY seq", (cursor,), max_bytes)
 
     def revealed(self) -> frozenset[str]:
         """Epochs whose secret is revealed."""
         with storage_errors(self._path):
             return frozenset(revealed(self._db))
 
-    def document(self, run: str, kind: str) -> bytes | None:
-        """The document whose hash an entry of the journal holds; None when it is missing."""
-        row = self._one(DocumentRow, "WHERE run = ? AND kind = ?", (run, kind))
-        return None if row is None else row.data
-
     def names_blob(self, run: str, digest: str) -> bool:
         """Whether the train feedback of `run` names the blob."""
         query = "SELECT 1 FROM train_blobs WHERE run = ? AND digest = ?"
         with storage_errors(self._path):
             return self._db.execute(query, (run, digest)).fetchone() is not None
-
-    def _one(self, kind: type[T], where: str, args: tuple[Any, ...]) -> T | None:
-        with storage_errors(self._path):
-            return next(rows(self._db, kind, where, args), None)
 
     def _page(self, kind: type[T], where: str, args: tuple[Any, ...], max_bytes: int) -> tuple[T, ...]:
         """Rows of up to `max_bytes`, but at least one if there is any."""
@@ -381,8 +341,7 @@ def storage_errors(path: Path) -> Iterator[None]:
 
 
 def rows(db: sqlite3.Connection, kind: type[T], where: str = "", args: tuple[Any, ...] = ()) -> Iterator[T]:
-    """Yields the rows of a kind. DamagedStoreError names the unreadable row; `storage_errors` adds the database's
-    path."""
+    """The rows of a kind. Raises DamagedStoreError with the unreadable row's key."""
     for row, _ in _sized_rows(db, kind, where, args):
         yield row
 
@@ -427,13 +386,13 @@ def _insert_of(place: _Place) -> tuple[str, tuple[Callable[[Any], object], ...]]
     return statement, tuple(_VALUES.get(name) or operator.attrgetter(name) for name in columns)
 
 
-_INSERTS = {kind: _insert_of(_PLACES[kind]) for kind in get_args(Row)}
+_INSERTS = {kind: _insert_of(_PLACES[kind]) for kind in get_args(records.Row)}
 
 
-def _write_row(db: sqlite3.Connection, row: Row) -> None:
+def _write_row(db: sqlite3.Connection, row: records.Row) -> None:
     statement, values = _INSERTS[type(row)]
     db.execute(statement, [value(row) for value in values])
-    if isinstance(row, OutcomeRow) and (run := train_run(row.group)) is not None:
+    if isinstance(row, records.OutcomeRow) and (run := train_run(row.group)) is not None:
         for ref in stored_blobs(row.outcome):
             db.execute("INSERT OR IGNORE INTO train_blobs VALUES (?, ?)", (run, ref.digest))
 

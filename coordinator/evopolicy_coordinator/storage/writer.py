@@ -49,11 +49,8 @@ class Outbox:
         carry_out: Callable[[Effect], None],
         on_failure: Callable[[BaseException], None],
     ) -> None:
-        """`carry_out` receives every effect except `Persist`. `on_failure` is called once; the outbox then drops
-        everything.
-
-        `on_failure` receives a StorageError when the store refuses, any other exception for a bug.
-        """
+        """`carry_out` receives every effect except `Persist`. `on_failure` is called once, with a
+        StorageError when the store refuses, or a bug's exception; the outbox then drops everything."""
         self._writer = writer
         self._carry_out = carry_out
         self._on_failure = on_failure
@@ -77,8 +74,7 @@ class Outbox:
             self._effects.append(effect)
 
     def flush(self) -> None:
-        """Carries out the effects that no persist holds back, and submits waiting rows if no transaction is in
-        flight."""
+        """Carries out the effects that no persist holds back; submits waiting rows, one write at a time."""
         if self._dead:
             return
         self._drain()

@@ -19,8 +19,7 @@ from typing import Any, NamedTuple
 import msgspec
 
 from evopolicy_common import catalogue
-from evopolicy_common.catalogue.installs import family_of
-from evopolicy_common.catalogue.licences import Licence, licences
+from evopolicy_common.catalogue.installs import Licence, family_of, licences
 from evopolicy_common.records import journal
 from evopolicy_common.records.aggregates import mean
 from evopolicy_common.records.canary import CANARY

@@ -15,10 +15,10 @@ from typing import Any, Literal
 
 import msgspec
 
-from evopolicy_common.catalogue.licences import Licence
+from evopolicy_common.catalogue.installs import Licence
 from evopolicy_common.errors import DECODE_ERRORS, ProtocolError
+from evopolicy_common.messages.audit import Committed
 from evopolicy_common.messages.episode import ResourceLimits
-from evopolicy_common.messages.journal import Committed
 from evopolicy_common.messages.run_settings import Start
 from evopolicy_common.records.run_record import Tokens
 from evopolicy_results.publish import contents

@@ -31,10 +31,10 @@ from evopolicy_common.messages.episode import EpisodeOutcome
 from evopolicy_common.messages.operator import DescribeEnvironment
 from evopolicy_common.processes.packages import packages_in
 from evopolicy_common.processes.scratch import scratch_folder
+from evopolicy_common.records.code_metrics import declares_deterministic
 from evopolicy_common.records.episodes import compare
 from evopolicy_common.records.episodes.trajectory import Trajectory
 from evopolicy_common.records.policies.bundles import Bundle
-from evopolicy_common.records.policies.declarations import declares_deterministic
 from evopolicy_common.records.splits import FILE_STEMS, SPLITS, SplitFile, cases_hash
 from evopolicy_common.wire import credentials, transport
 from evopolicy_results.evaluations import Cases, Evaluations, sample, unlike

@@ -117,7 +117,7 @@ def secret_lines(data: bytes, passed: Passed | None) -> dict[int, str]:
     """The lines with a secret, counted from 1, each with the kind of its first one."""
     lines: dict[int, str] = {}
     line, counted = 1, 0
-    for at, what in sorted(secrets.found(data, passed)):
+    for at, what in sorted(secrets.positions(data, passed)):
         line, counted = line + data.count(b"\n", counted, at), at
         lines.setdefault(line, what)
     return lines

@@ -13,7 +13,7 @@ import pytest
 from commands import evopolicy
 from publications import Forger, Held, Results
 
-from evopolicy_common.catalogue.licences import licences
+from evopolicy_common.catalogue.installs import licences
 from evopolicy_results.publish import card as cards
 from evopolicy_results.publish import contents, descriptions, rules
 from evopolicy_results.publish.findings import Checked

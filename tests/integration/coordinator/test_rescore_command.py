@@ -21,6 +21,7 @@ from commands import agent, evopolicy, words
 from evopolicy_common.messages.environment import Case
 from evopolicy_common.records.rescores import RescoreRecord, read_rescore
 from evopolicy_common.records.splits import SplitFile
+from evopolicy_coordinator.core.contract.records import RunRow
 from evopolicy_coordinator.splits import load_or_create_secret
 from evopolicy_coordinator.storage.store import Reader
 
@@ -215,7 +216,7 @@ def test_cases_of_files_are_played_and_must_be_disjoint(played: Played) -> None:
 def hidden_seeds(played: Played) -> list[int]:
     """Seeds of the held-out cases that both runs played."""
     reader = Reader(played.root / "st" / "coordinator.sqlite")
-    row = reader.run(json.loads((played.run("mine") / "run.json").read_text())["run"])
+    row = reader.one(RunRow, run=json.loads((played.run("mine") / "run.json").read_text())["run"])
     assert row is not None
     return [case.seed for case in row.heldout]
 

@@ -55,7 +55,7 @@ class Site:
         machines.write_passwords()
         assert machines.tls is not None
         listed = [(machine.role, machine.identity) for machine in machines.admitted()]
-        config = transport.tls_server_config(
+        config = transport.server_config(
             CLUSTER, [self.certs.endpoint], machines.passwords, listed, machines.tls
         )
         async with transport.serve(config, asked) as server, open_router(self.folder):
@@ -165,7 +165,7 @@ def test_the_file_holds_the_coordinators_own_rules(site: Site) -> None:
         for machine in Machines(site.certs.state).admitted()
         if machine.name in ("here", "desk")
     ]
-    own = transport.machine_access_control(CLUSTER, admitted)
+    own = transport.access_control(CLUSTER, admitted)
     rights = document["access_control"]
     for part in ("rules", "subjects", "policies"):
         assert rights[part][: len(own[part])] == own[part]

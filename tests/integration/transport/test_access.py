@@ -28,7 +28,7 @@ def credentials(folder: Path, role: Role, password: str | None = None) -> Creden
 
 def config_of(folder: Path) -> zenoh.Config:
     (folder / "passwords").write_text("".join(f"{user}:{word}\n" for user, word in PASSWORDS.items()))
-    users: dict[Role, str] = {role: role for role in PASSWORDS}
+    users = [(role, role) for role in PASSWORDS]
     return transport.server_config(CLUSTER, [f"unixsock-stream/{folder}/sock"], folder / "passwords", users)
 
 

@@ -36,7 +36,7 @@ async def mute(folder: Path, role: Role = "operator") -> AsyncIterator[Link]:
     heard: list[IncomingQuery] = []
     (folder / "passwords").write_text(f"{role}:secret\n")
     endpoints = (f"unixsock-stream/{folder}/sock",)
-    config = transport.server_config("test", endpoints, folder / "passwords", {role: role})
+    config = transport.server_config("test", endpoints, folder / "passwords", [(role, role)])
     found = Credentials(
         cluster="test", role=role, endpoints=endpoints, user=role, password="secret", token=""
     )

@@ -169,7 +169,7 @@ async def test_a_machines_certificate_cannot_stand_in_for_the_coordinators(certs
     honest, other = of(folder(certs, "worker-honest")), of(folder(certs, "worker-other"))
     assert other.tls is not None
     passwords, admitted = Machines(certs.state).passwords, [("worker", "worker/honest")]
-    config = transport.tls_server_config(CLUSTER, [certs.endpoint], passwords, admitted, other.tls)
+    config = transport.server_config(CLUSTER, [certs.endpoint], passwords, admitted, other.tls)
     Machines(certs.state).write_passwords()
     heard: list[IncomingQuery] = []
     async with transport.serve(config, heard.extend) as server:

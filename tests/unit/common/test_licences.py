@@ -11,8 +11,7 @@ from typing import Any
 
 import pytest
 
-from evopolicy_common.catalogue.installs import installs, is_here
-from evopolicy_common.catalogue.licences import UNKNOWN, licences, packages
+from evopolicy_common.catalogue.installs import UNKNOWN, installs, is_here, licences, packages
 
 ROOT = Path(__file__).parents[3]
 SITE = Path(sysconfig.get_path("purelib"))

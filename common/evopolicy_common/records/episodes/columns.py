@@ -185,10 +185,8 @@ def most_of(compressed: bytes | memoryview) -> int:
 
 
 def count_values(packed: bytes, most: int) -> int:
-    """Number of values in a msgpack text, counted up to `most` + 1; each may become an object of 72 bytes.
-
-    One pass suffices: values follow each other in the text, however they nest.
-    """
+    """Values in a msgpack text, counted up to `most` + 1 in one pass, however they nest; each may take 72
+    bytes."""
     n, at, end = 0, 0, len(packed)
     while at < end and n <= most:
         head, (fixed, counted) = packed[at], _SIZES[packed[at]]

@@ -127,10 +127,8 @@ def check_archive(data: bytes | memoryview, most: int) -> None:
 
 
 def read_arrays(data: bytes, most: int) -> dict[str, NDArray[Any]]:
-    """The arrays of an `.npz` file by name, or that of an `.npy` file under the empty name. Nothing is unpickled.
-
-    Raises ValueError for anything else, and for a file that unpacks to more than `most` bytes, before it is unpacked.
-    """
+    """The arrays of an `.npz` file by name, or that of an `.npy` file under the empty name. Nothing is
+    unpickled. Raises ValueError for anything else, and before it would unpack more than `most` bytes."""
     try:
         if data[:2] == b"PK":
             check_archive(data, most)
@@ -146,11 +144,8 @@ def read_arrays(data: bytes, most: int) -> dict[str, NDArray[Any]]:
 
 
 def crc_of_both(first: int, second: int, n: int) -> int:
-    """CRC-32 of two concatenated texts, from their CRCs and the second one's length `n` in bytes.
-
-    Appending n bytes multiplies by x^8n modulo the polynomial. Coefficients are in reverse order: the highest bit is
-    x^0.
-    """
+    """CRC-32 of two concatenated texts, from their CRCs and the second one's length `n` in bytes, which
+    multiplies by x^8n modulo the polynomial. The highest bit of a coefficient is x^0."""
     factor, power = 1 << 31, 1 << 23  # x^0 and x^8
     while n:
         if n & 1:

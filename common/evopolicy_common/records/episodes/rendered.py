@@ -196,10 +196,8 @@ class Renderer(Recorder):
 
 
 def _texts(steps: Sequence[Sequence[Any] | None], first: int, size: int) -> Iterator[bytes]:
-    """The lines of steps from `first` on, in portions, since a short action may have a long text.
-
-    `steps`: the columns of `rows_text`. Raises ProtocolError when `size` plus their bytes exceeds the limit.
-    """
+    """The lines of steps (columns of `rows_text`) from `first` on, in portions, since a short action may have
+    a long text. Raises ProtocolError when `size` plus their bytes exceeds the limit."""
     for at in range(0, len(steps[-1] or ()), _STEPS_AT_ONCE):
         part = [None if column is None else column[at : at + _STEPS_AT_ONCE] for column in steps]
         text = rows_text(first + at, *part)  # type: ignore[arg-type]
@@ -306,10 +304,8 @@ _rows_decoder = msgspec.json.Decoder(_Row)
 
 
 def files_of(episode: Trajectory, storage: ObsStorage | None) -> dict[str, bytes]:
-    """The feedback files of an episode, rendered here if they were not rendered before.
-
-    `storage` None: chosen by the observations themselves. Raises ProtocolError beyond the limit of `trajectory.jsonl`.
-    """
+    """The feedback files. `storage` None: chosen by the observations. Raises ProtocolError beyond the
+    limit."""
     if episode.files:
         return episode.files
     outside = storage != "inline" if storage is not None else _holds_pictures(episode.obs)

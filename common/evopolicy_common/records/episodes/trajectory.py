@@ -57,11 +57,9 @@ class Row(NamedTuple):
 
     t: int
     obs: Any
-    """numpy array, int, str, dict or tuple (nested lists in place of arrays and tuples with `observations` "lists");
-    None when observations are not recorded."""
+    """An array, int, str, dict or tuple (nested lists with `observations` "lists"); None if not recorded."""
     action: Any
-    """As the policy returned it, before repair: array, plain number, string, list, dict, None (a tuple becomes a
-    list when actions differ in form)."""
+    """As the policy returned it, before repair; a tuple may have become a list."""
     reward: float
     terminated: bool
     truncated: bool

@@ -35,8 +35,7 @@ IGNORED_FOLDERS = frozenset(
 )
 """Folders that tools create; never part of a bundle."""
 COMPILED = ".pyc"
-"""How compiled code ends, which Python may load in place of the source that readers see; never part of a bundle
-either."""
+"""Suffix of compiled code, which may differ from its source; never part of a bundle either."""
 
 
 class BundleFile(msgspec.Struct, frozen=True, array_like=True):
@@ -70,23 +69,23 @@ def snapshot(folder: Path, leave_out: Collection[str] = ()) -> Bundle:
     except OSError as error:
         raise BundleError(f"{folder.name}/ is not a folder that can be read: {error.strerror}") from error
     files: list[BundleFile] = []
-    left = MAX_BYTES
+    free = MAX_BYTES
     try:
         for path, file in walk(root, leave_out, MAX_ENTRIES):
             if isinstance(file, str):
                 raise BundleError(f"{path or 'system/'} {file}")
             with file:
                 info = os.fstat(file.fileno())
-                data = file.read(left + 1) if info.st_size <= left else b""
+                data = file.read(free + 1) if info.st_size <= free else b""
             if len(files) == MAX_FILES:
                 raise BundleError(f"system/ holds more than {MAX_FILES} files; pack data into fewer")
             size = max(info.st_size, len(data))
-            if size > left:
+            if size > free:
                 raise BundleError(
                     f"{path} has {size:,} bytes; all files of system/ together may have {MAX_BYTES:,}"
-                    f" and {left:,} are left: make it smaller or remove it"
+                    f" and {free:,} are left: make it smaller or remove it"
                 )
-            left -= size
+            free -= size
             files.append(BundleFile(path, bool(info.st_mode & stat.S_IXUSR), data))
     finally:
         os.close(root)
@@ -109,16 +108,16 @@ def walk(root: int, leave_out: Collection[str], most: int) -> Iterator[tuple[str
     Neither follows a link nor opens anything but regular files and folders. `leave_out`: entries of the folder
     itself to pass over, as files and folders that tools make are. `most`: files and folders to look at.
     """
-    left = most
+    remaining = most
 
     def below(fd: int, base: str, depth: int) -> Iterator[tuple[str, BinaryIO | str]]:
-        nonlocal left
+        nonlocal remaining
         with os.scandir(fd) as entries:
-            names = sorted(entry.name for entry in itertools.islice(entries, left + 1))
-        if len(names) > left:
+            names = sorted(entry.name for entry in itertools.islice(entries, remaining + 1))
+        if len(names) > remaining:
             yield base, f"holds more than {most} files and folders; remove some"
             return
-        left -= len(names)
+        remaining -= len(names)
         for name in names:
             path = f"{base}/{name}" if base else name
             if not base and name in leave_out:
@@ -127,11 +126,10 @@ def walk(root: int, leave_out: Collection[str], most: int) -> Iterator[tuple[str
                 check_path(path)
                 mode = os.stat(name, dir_fd=fd, follow_symlinks=False).st_mode
                 is_folder = stat.S_ISDIR(mode)
-                if name in (IGNORED_FOLDERS if is_folder else ()) or (
-                    stat.S_ISREG(mode) and name.endswith(COMPILED)
-                ):
+                is_file = stat.S_ISREG(mode)
+                if (is_folder and name in IGNORED_FOLDERS) or (is_file and name.endswith(COMPILED)):
                     continue
-                if stat.S_ISREG(mode):
+                if is_file:
                     # Not followed: a hostile agent may replace the entry with a link after the stat.
                     file = open_regular(name, fd)
                     if linked := os.fstat(file.fileno()).st_nlink > 1:
@@ -202,8 +200,7 @@ def _check(files: tuple[BundleFile, ...]) -> None:
         check_path(file.path)
         if file.path.endswith(COMPILED):
             raise BundleError(f"{file.path!a} is compiled code, which may differ from its source; remove it")
-    names = [file.path for file in files]
-    if len(set(names)) != len(names):
+    if len({file.path for file in files}) != len(files):
         raise BundleError("bundle names a path twice")
 
 

@@ -51,8 +51,7 @@ class CheckpointMeta(msgspec.Struct, frozen=True, kw_only=True):
     remaining_budget_after: int
     snapshot_size_bytes: int = 0
     snapshot_files: Any = ()
-    """Paths of the policy's files. Nothing relies on this field or `import_scan`: other software may have written
-    them."""
+    """Paths of the policy's files. Other software may have written this field and `import_scan`."""
     import_scan: Any = None
     """An `ImportScan`."""
     validation_status: str
@@ -96,10 +95,8 @@ def measured(bundle: Bundle | None) -> CodeMetrics:
 
 
 def write(folder: Path, meta: CheckpointMeta, bundle: Bundle | None, metrics: CodeMetrics | None) -> None:
-    """Creates `folder` anew. `meta` describes the submit; its fields on files are set here.
-
-    `metrics`: of the bundle; None leaves out `metrics.json` and `import_scan`.
-    """
+    """Creates `folder` anew. `meta` describes the submit; its fields on files are set here. `metrics`: of the
+    bundle; None leaves out `metrics.json` and `import_scan`."""
     if folder.exists():
         shutil.rmtree(folder)
     files = () if bundle is None else bundle.files
@@ -107,15 +104,13 @@ def write(folder: Path, meta: CheckpointMeta, bundle: Bundle | None, metrics: Co
     for path in folder.rglob("*"):
         if path.is_file():
             path.chmod(path.stat().st_mode & 0o555)
+    imports = () if metrics is None else metrics.imports
+    scan = ImportScan(imports=imports, denied=tuple(name for name in imports if name in SIMULATORS))
     meta = msgspec.structs.replace(
         meta,
         snapshot_size_bytes=sum(len(file.data) for file in files),
         snapshot_files=tuple(file.path for file in files),
-        import_scan=None
-        if metrics is None
-        else ImportScan(
-            imports=metrics.imports, denied=tuple(name for name in metrics.imports if name in SIMULATORS)
-        ),
+        import_scan=None if metrics is None else scan,
         bundle="" if bundle is None else bundle.digest,
         shadowed_files=tuple(file for file in files if file.path in METADATA),
     )
@@ -135,9 +130,7 @@ def read_meta(folder: Path, episode_budget: int) -> CheckpointMeta | None:
         try:
             data = read_regular(folder / name, _MAX_META_BYTES)
             if name == META:
-                meta = _meta.decode(data)
-                check_plausible(meta)
-                return meta
+                return check_plausible(_meta.decode(data))
             if _header.decode(data).schema_version == PUBLISHED_SCHEMA:
                 return None  # the current `metrics.json`, without its `_meta.json`
             return _upgraded(_old_metrics.decode(data), episode_budget)

@@ -26,7 +26,7 @@ import msgspec
 from evopolicy_common.errors import DECODE_ERRORS, BundleError, ConfigError, StorageError
 from evopolicy_common.records.blobs import BlobStore, digest_of, sync_filesystem, write_atomically
 from evopolicy_common.records.policies.bundles import FOLDER, Bundle, BundleFile, check_path, walk, write_new
-from evopolicy_common.records.secrets import Passed, found
+from evopolicy_common.records.secrets import Passed, positions
 from evopolicy_common.regular_files import read_regular
 
 TREES = "trees"
@@ -83,8 +83,7 @@ def name_of(folder: Path, index: int) -> str:
 
 
 def changes(folder: Path, index: int) -> str:
-    """Files outside `system/` in which the workspace differs from that at the submit before, in words; empty where
-    there are none, or no tree. `folder`: the run's."""
+    """In words, the files outside `system/` that changed since the submit before; may be empty."""
     try:
         trees = [read(folder, name_of(folder, n))[0] for n in (index - 1, index) if n >= 0]
     except ConfigError:
@@ -133,8 +132,7 @@ def read(folder: Path, submit: str) -> tuple[Tree, str]:
 
 
 def restore(folder: Path, tree: Tree, workspace: Path) -> None:
-    """Writes the files of a tree of the run at `folder` below `workspace`. Raises StorageError for a missing or
-    wrong content, and where the disk refuses."""
+    """Writes a tree's files below `workspace`. Raises StorageError for wrong content or a full disk."""
     blobs = BlobStore(folder / TREES)
     for file in tree.files:
         try:
@@ -149,9 +147,8 @@ def restore(folder: Path, tree: Tree, workspace: Path) -> None:
 def copy_history(
     feedback: Path, history: Path, last: int, to: Path, most: int = MAX_STORED_BYTES
 ) -> dict[str, str]:
-    """Copies the feedback of the submits up to index `last`, and the run's own `history` as `earlier/`, to the
-    folder `to`, read-only. Returns the omissions, with reasons: links, special files, and files beyond `most` bytes.
-    """
+    """Copies the feedback of submits up to index `last`, and the run's `history` as `earlier/`, to `to`,
+    read-only. Returns the omissions, with reasons: links, special files, and files beyond `most` bytes."""
     omitted: dict[str, str] = {}
     names = sorted(os.listdir(feedback)) if feedback.is_dir() and not feedback.is_symlink() else []
     kept = [name for name in names if (number := submit_number(name)) is not None and number <= last]
@@ -175,8 +172,7 @@ class Recorder:
     """Records the workspace of one run. Contents of an earlier process count."""
 
     def __init__(self, workspace: Path, folder: Path, *, started: bool = False) -> None:
-        """`folder`: the run's `trees/`, outside the agent's reach. `started`: from a submit, so that `history/` is
-        the service's, and no omission."""
+        """`folder`: the run's `trees/`. `started`: from a submit, so that `history/` is the service's."""
         self._workspace, self._folder, self._started = workspace, folder, started
         self._blobs = BlobStore(folder)
         self._stored = sum(self._blobs.size(digest) for digest in self._blobs.digests())
@@ -185,29 +181,30 @@ class Recorder:
 
     def record(self, submit: str, bundle: Bundle | None, passed: Passed | None) -> str:
         """Records the workspace now and returns the tree's digest. `bundle`: of this submit's `system/`. `passed`:
-        values of the run, left out as keys are. Raises OSError and StorageError where the disk refuses."""
+        values of the run, omitted as keys are. Raises OSError and StorageError where the disk refuses."""
         files: list[TreeFile] = []
         omitted: dict[str, str] = {}
         seen: dict[str, _Seen] = {}
-        stored, left = self._stored, MAX_TREE_BYTES
+        stored, free = self._stored, MAX_TREE_BYTES
         if not self._started and os.path.lexists(self._workspace / HISTORY):
             omitted[HISTORY] = "reserved for the history of a run that starts from a submit"
         n_omitted = len(omitted)
         whole = LEFT_OUT if bundle is None else LEFT_OUT | {"system"}
-        for path, taken in itertools.chain(_of(bundle), _walk(self._workspace, whole, 2 * MAX_FILES)):
+        submitted = ((f"system/{file.path}", file) for file in (() if bundle is None else bundle.files))
+        for path, taken in itertools.chain(submitted, _walk(self._workspace, whole, 2 * MAX_FILES)):
             one: TreeFile | str
             if isinstance(taken, str):
                 one = taken
             elif isinstance(taken, BundleFile):
-                one = self._keep(path, taken.executable, taken.data, left, passed)
+                one = self._keep(path, taken.executable, taken.data, free, passed)
             else:
                 with taken:
-                    one = self._read(path, taken, left, passed, seen)
+                    one = self._read(path, taken, free, passed, seen)
             if isinstance(one, TreeFile) and len(files) == MAX_FILES:
                 one = f"more than {MAX_FILES} files"
             if isinstance(one, TreeFile):
                 files.append(one)
-                left -= one.size
+                free -= one.size
                 continue
             n_omitted += 1
             if len(omitted) < MAX_LISTED:
@@ -221,40 +218,36 @@ class Recorder:
         return digest_of(data)
 
     def _read(
-        self, path: str, file: BinaryIO, left: int, passed: Passed | None, seen: dict[str, _Seen]
+        self, path: str, file: BinaryIO, free: int, passed: Passed | None, seen: dict[str, _Seen]
     ) -> TreeFile | str:
         info, now = os.fstat(file.fileno()), time.time_ns()
         state, known = (info.st_ino, info.st_ctime_ns, info.st_size), self._seen.get(path)
-        if known is not None and known[0] == state and info.st_size <= left:
+        if known is not None and known[0] == state and info.st_size <= free:
             one: TreeFile | str = known[1]
-        elif info.st_size > min(left, MAX_FILE_BYTES):
+        elif info.st_size > min(free, MAX_FILE_BYTES):
             one = f"{info.st_size:,} bytes are too many"
         else:
             data = file.read(info.st_size + 1)
-            one = self._keep(path, bool(info.st_mode & stat.S_IXUSR), data, left, passed)
+            one = self._keep(path, bool(info.st_mode & stat.S_IXUSR), data, free, passed)
         if isinstance(one, TreeFile) and info.st_ctime_ns + _SETTLED_NS < now:
             seen[path] = state, one
         return one
 
     def _keep(
-        self, path: str, executable: bool, data: bytes, left: int, passed: Passed | None
+        self, path: str, executable: bool, data: bytes, free: int, passed: Passed | None
     ) -> TreeFile | str:
         """The file, stored, or why it is omitted."""
-        if len(data) > left:
+        if len(data) > free:
             return f"{len(data):,} bytes are too many"
         digest = digest_of(data)
         if not self._blobs.has(digest):
-            for _, what in found(data, passed):
+            for _, what in positions(data, passed):
                 return f"holds {what}"
             if self._stored + len(data) > MAX_STORED_BYTES:
                 return f"the run's trees hold {MAX_STORED_BYTES:,} bytes"
             self._blobs.put(data, durable=False)
             self._stored += len(data)
         return TreeFile(path, digest, len(data), executable)
-
-
-def _of(bundle: Bundle | None) -> Iterator[tuple[str, BundleFile]]:
-    return ((f"system/{file.path}", file) for file in (() if bundle is None else bundle.files))
 
 
 def _walk(root: Path, leave_out: Collection[str], most: int) -> Iterator[tuple[str, BinaryIO | str]]:

@@ -14,6 +14,7 @@ from typing import Any, Literal, TypeVar
 
 import msgspec
 
+from evopolicy_common.messages.audit import Committed
 from evopolicy_common.messages.environment import Case, EnvironmentDescription, Split
 from evopolicy_common.messages.episode import (
     BlobRef,
@@ -25,7 +26,6 @@ from evopolicy_common.messages.episode import (
     Tier,
 )
 from evopolicy_common.messages.gateway import SubmitDone, SubmitStatus
-from evopolicy_common.messages.journal import Committed
 from evopolicy_common.messages.operator import PlayedAs, RunFinished
 from evopolicy_common.messages.run_settings import HiddenIsolation, RunSettings
 from evopolicy_common.messages.worker import Fingerprint

@@ -14,11 +14,15 @@ from pathlib import Path
 import pytest
 
 from evopolicy_common.errors import BundleError, ProtocolError
-from evopolicy_common.records.code_metrics import MAX_PARSED_BYTES, code_metrics, parse
+from evopolicy_common.records.code_metrics import (
+    MAX_PARSED_BYTES,
+    code_metrics,
+    declares_deterministic,
+    parse,
+)
 from evopolicy_common.records.policies import bundles, checkpoints
 from evopolicy_common.records.policies.bundles import MAX_FILES, BundleFile, pack
 from evopolicy_common.records.policies.checkpoints import CheckpointMeta, measured
-from evopolicy_common.records.policies.declarations import declares_deterministic
 
 META = CheckpointMeta(
     submit_index=2,

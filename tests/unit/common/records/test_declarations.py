@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from evopolicy_common.records.policies.declarations import declares_deterministic
+from evopolicy_common.records.code_metrics import declares_deterministic
 
 
 @pytest.mark.parametrize(

@@ -34,15 +34,15 @@ ROOT = Path(__file__).parents[4]
 def test_each_look_of_a_key_is_found_and_removed_also_in_json(secret: str) -> None:
     for text in (f"x = '{secret}'", f"{secret}\n", json.dumps({"text": f"a\n{secret}\tb"})):
         data = text.encode()
-        assert len(list(secrets.found(data))) == 1, text
+        assert len(list(secrets.positions(data))) == 1, text
         assert BODY.encode()[:8] not in secrets.redacted(data)
-        assert list(secrets.found(secrets.redacted(data))) == []
+        assert list(secrets.positions(secrets.redacted(data))) == []
     json.loads(secrets.redacted(json.dumps({"text": f'a\n{secret}\\ "{secret}"'}).encode()))
 
 
 def test_a_bearer_token_is_found_and_its_header_stays() -> None:
     assert secrets.redacted(f"Authorization: Bearer  {BODY}".encode()) == b"Authorization: Bearer [redacted]"
-    assert list(secrets.found(b"the bearer of responsibilities")) == []
+    assert list(secrets.positions(b"the bearer of responsibilities")) == []
 
 
 def test_policies_with_hashes_and_arrays_in_base64_hold_no_secret() -> None:
@@ -53,14 +53,14 @@ def test_policies_with_hashes_and_arrays_in_base64_hold_no_secret() -> None:
     lines += [
         b"task-list, mask-rcnn, risk-averse-policy-with-7-steps, sk-xxxxxxxxxxxxxxxxxxxx1, pk-of-the-table"
     ]
-    assert list(secrets.found(b"\n".join(lines))) == []
+    assert list(secrets.positions(b"\n".join(lines))) == []
 
 
 def test_examples_and_tests_of_this_project_hold_no_secret_by_mistake() -> None:
     files = [path for path in (ROOT / "examples").rglob("*") if path.is_file()]
     files += (ROOT / "tests" / "conformance" / "hostile" / "policies").glob("*.py")
     assert len(files) > 40
-    assert [path for path in files if list(secrets.found(path.read_bytes()))] == []
+    assert [path for path in files if list(secrets.positions(path.read_bytes()))] == []
 
 
 @pytest.mark.parametrize(
@@ -164,5 +164,5 @@ def test_searching_takes_time_linear_in_the_size_of_a_file(piece: bytes) -> None
     size = 1 << 20
     passed = Passed(key=os.urandom(32).hex()).with_values(["a" * 40, "b" * 41, "sk-" * 20])
     data = (piece * (size // len(piece) + 1))[:size]
-    list(secrets.found(data, passed))
+    list(secrets.positions(data, passed))
     secrets.redacted(data)

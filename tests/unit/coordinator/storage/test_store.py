@@ -112,8 +112,9 @@ def test_the_journal_can_only_grow(path: Path) -> None:
         assert reader.journal(0, 1) == (first,)
         assert reader.journal(0, 1000) == (first, last)
         assert reader.journal(2, 1000) == ()
-        assert reader.document("r-1", "opening") == b"{}"
-        assert reader.document("r-1", "result") is None
+        opening, result = (reader.one(DocumentRow, run="r-1", kind=kind) for kind in ("opening", "result"))
+        assert opening is not None
+        assert (opening.data, result) == (b"{}", None)
 
 
 def test_a_store_from_before_the_journal_opens_with_an_empty_one(
@@ -319,7 +320,10 @@ def test_an_outcome_that_cannot_be_read_is_named(store: Store, path: Path) -> No
     store.write([run_row(), state_row(), submit_row(), outcome_row(TRAIN, 3, 0)])
     store._db.execute("UPDATE outcomes SET data = x'00'")
     reader = Reader(path)
-    for read in (lambda: reader.outcomes(TRAIN, 0, 9, 1 << 20), lambda: reader.outcome(TRAIN, 3)):
+    for read in (
+        lambda: reader.outcomes(TRAIN, 0, 9, 1 << 20),
+        lambda: reader.one(records.OutcomeRow, grp=TRAIN, idx=3),
+    ):
         with pytest.raises(DamagedStoreError, match=r"table outcomes, row .*'r-1/s0/train', 3"):
             read()
     reader.close()
