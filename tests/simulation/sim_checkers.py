@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections import Counter
 from typing import TYPE_CHECKING, Any
 
+from rigs.core_invariants import check_invariants
 from sim_oracle import ExpectedRun, PlannedRun, expect
 from sim_worker import begun_of
 
@@ -361,7 +362,7 @@ class Checkers:
     def loaded(self, core: Core) -> None:
         self._core = core
         self._early_since = {}
-        core.validate()
+        check_invariants(core.state)
 
     def stepped(self, core: Core) -> None:
         self._steps += 1
@@ -372,7 +373,7 @@ class Checkers:
         for flow in core.state.unpinned.values():
             want(fleet.offer(core.state, flow) is None, "only runs without workers are unpinned", flow.id)
         if self._steps % VALIDATE_EVERY == 0:
-            core.validate()
+            check_invariants(core.state)
             self._preempted(core)
             self._drained(core)
 
@@ -415,7 +416,7 @@ class Checkers:
         """All runs are over: none of their state is left in memory, and every retry had a reason."""
         want(core is not None, "the coordinator is there in the end")
         assert core is not None
-        core.validate()
+        check_invariants(core.state)
         left = (len(core.state.groups), len(core.state.jobs), len(core.state.polls), len(core.state.runs))
         want(left == (0, 0, 0, 0), "nothing is left in memory", left)
         if self._simulation.harmless:

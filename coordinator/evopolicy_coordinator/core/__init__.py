@@ -3,7 +3,6 @@
     core, effects = Core.load(settings, snapshot, now)
     effects = core.handle(event, now)
     effects = core.handle_deadline(now)         # when now >= core.next_deadline()
-    core.validate()                             # raises InvariantError; cheap enough for tests only
 
 The core has no clock, random numbers, disk, log or await: `now` and randomness come in, ordered effects and the next
 deadline go out.

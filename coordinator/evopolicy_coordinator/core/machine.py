@@ -13,7 +13,7 @@ from typing import Any
 
 from evopolicy_common.messages import gateway, operator
 from evopolicy_common.messages import worker as wire
-from evopolicy_coordinator.core import invariants, loading, status
+from evopolicy_coordinator.core import loading, status
 from evopolicy_coordinator.core.agents import permits, precedence, requests
 from evopolicy_coordinator.core.contract import events
 from evopolicy_coordinator.core.contract.effects import Effect
@@ -86,10 +86,6 @@ class Core:
             TIMERS[kind](self.state, what, this)
             effects += self._end(this)
         return effects
-
-    def validate(self) -> None:
-        """Check every invariant; raises InvariantError at a violation. Visits all state: for tests."""
-        invariants.check(self.state)
 
     # ---- reading ----
 

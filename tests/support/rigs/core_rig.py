@@ -55,6 +55,7 @@ from evopolicy_coordinator.core.status import CoreStatus
 from evopolicy_coordinator.server.reason_texts import message, words
 from evopolicy_coordinator.storage.store import _PLACES, _VALUES
 from rigs.asking import asked
+from rigs.core_invariants import check_invariants
 
 ENV = "toy/line"
 BUNDLE = "a" * 64
@@ -143,7 +144,7 @@ class Rig:
     def tell(self, event: events.AnyEvent) -> Any:
         """Hand an event in; gives the answer to its request, None while it waits."""
         self._carry_out(self.core.handle(event, self.now))
-        self.core.validate()
+        check_invariants(self.core.state)
         return self.replies.get(getattr(event, "request", None))  # type: ignore[arg-type]
 
     def ask(self, kind: type[Message], **fields: Any) -> Any:
@@ -159,7 +160,7 @@ class Rig:
                 break
             self.now = max(self.now, due)
             self._carry_out(self.core.handle_deadline(self.now))
-            self.core.validate()
+            check_invariants(self.core.state)
         self.now = until
 
     def _carry_out(self, effects: list[Effect]) -> None:

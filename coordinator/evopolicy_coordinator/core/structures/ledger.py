@@ -54,12 +54,6 @@ class Ledger:
             raise InvariantError(f"nothing is reserved for submit {submit_index}: {self}")
         return n
 
-    def validate(self) -> None:
-        """Raises InvariantError when the sum is not `granted` or a part is negative."""
-        total = self.available + self.reserved + self.settled
-        if total != self.granted or min(self.available, self.settled, self.reserved) < 0:
-            raise InvariantError(f"budget is not conserved: {self}")
-
     def __repr__(self) -> str:
         return (
             f"Ledger(granted={self.granted}, available={self.available}, reserved={self._reservations}, "

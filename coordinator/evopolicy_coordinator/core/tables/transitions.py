@@ -1,6 +1,6 @@
 """Allowed transitions as data: phases of a run, verdicts of a submit, places of a job, states of an audit.
 
-Every change of one of these goes through `check`; `invariants` reads the same tables.
+Every change of one of these goes through `check`.
 """
 
 from __future__ import annotations

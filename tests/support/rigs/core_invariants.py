@@ -1,4 +1,4 @@
-"""Invariants that hold between any two steps of a core. The checks visit all state: for tests and the simulation."""
+"""Invariants of a core's state, which hold between any two steps."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from evopolicy_coordinator.core.tables.state import State
 from evopolicy_coordinator.core.tables.transitions import AUDIT, JOB, RUN, SUBMIT
 
 
-def check(state: State) -> None:
+def check_invariants(state: State) -> None:
     """Raises InvariantError, which names the record concerned, at the first violation."""
     _jobs(state)
     _queue(state)
@@ -20,7 +20,8 @@ def check(state: State) -> None:
     _audits(state)
     _isolation(state)
     for run in state.runs.values():
-        run.ledger.validate()
+        parts = (run.ledger.available, run.ledger.reserved, run.ledger.settled)
+        want(run.id, sum(parts) == run.ledger.granted and min(parts) >= 0, "the budget is conserved")
         phase = run.state.phase
         want(run.id, RUN[phase], "only unfinished runs are open")
         unsettled = [row.submit_index for row in run.submits if SUBMIT[row.status or "open"]]
