@@ -23,6 +23,7 @@ from evopolicy_common.errors import ConfigError
 from evopolicy_common.messages.run_settings import ELSEWHERE
 from evopolicy_common.processes import host
 from evopolicy_common.records.open_run import IntendedRun
+from evopolicy_common.wire.credentials import host_and_port
 from evopolicy_gateway.run_folder.layout import RunFolder, saved
 
 AGENT = "remote"
@@ -52,12 +53,7 @@ class AgentPlace(msgspec.Struct, frozen=True, kw_only=True):
 
 def listener_of(http: str, url: str | None) -> Listener:
     """Parses `--http HOST:PORT` and `--http-url`. Raises ConfigError for invalid values."""
-    address, colon, port = http.rpartition(":")
-    address = address.removeprefix("[").removesuffix("]")
-    if not colon or not address or not port.isdecimal() or not 0 <= int(port) < 1 << 16:
-        raise ConfigError(
-            f"--http {http!r}: use the form HOST:PORT, such as 10.0.0.5:8080; port 0 takes a free one"
-        )
+    address, port = host_and_port("--http", http, "10.0.0.5:8080; port 0 takes a free one")
     if url is None:
         wildcard = False
         with contextlib.suppress(ValueError):  # a name
@@ -67,13 +63,13 @@ def listener_of(http: str, url: str | None) -> Listener:
                 f"--http {http}: an agent cannot connect to a wildcard address; name an address of this machine, or"
                 " give the URL with --http-url"
             )
-        return Listener(host=address, port=int(port))
+        return Listener(host=address, port=port)
     parts = urlsplit(url)
     if parts.scheme not in ("http", "https") or not parts.hostname or parts.query or parts.fragment:
         raise ConfigError(f"--http-url {url!r}: use the form https://HOST or https://HOST:PORT/PATH")
     if any(not (letter.isalnum() or letter in "-._~:/[]%") for letter in url):
         raise ConfigError(f"--http-url {url!r}: must be a plain URL, without quotes and spaces")
-    return Listener(host=address, port=int(port), url=url.rstrip("/"))
+    return Listener(host=address, port=port, url=url.rstrip("/"))
 
 
 def check_agent(agent: str, listener: Listener | None) -> None:

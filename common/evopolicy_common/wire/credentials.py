@@ -137,6 +137,15 @@ def stays_on_machine(endpoint: str) -> bool:
         return False
 
 
+def host_and_port(option: str, value: str, example: str) -> tuple[str, int]:
+    """The parts of `HOST:PORT`, the value of an option. Raises ConfigError for another form."""
+    host, _, port = value.rpartition(":")
+    host = host.removeprefix("[").removesuffix("]")
+    if not host or not port.isdecimal() or int(port) >= 1 << 16:
+        raise ConfigError(f"{option} {value!r}: use the form HOST:PORT, such as {example}")
+    return host, int(port)
+
+
 def publish(endpoints: tuple[str, ...], folder: Path) -> None:
     """Registers `folder` for these endpoints, for this user's commands. Raises ConfigError if it cannot."""
     registry = state_home() / "clusters"

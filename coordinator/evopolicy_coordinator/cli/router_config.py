@@ -27,69 +27,11 @@ from evopolicy_common.wire import transport
 from evopolicy_common.wire.credentials import TlsFiles, default_state_dir
 from evopolicy_coordinator.cli.certs import PORT, first_endpoint
 from evopolicy_coordinator.pki import certs
-from evopolicy_coordinator.pki.machines import Machine, Machines, write_passwords
+from evopolicy_coordinator.pki.machines import Machines, write_passwords
 from evopolicy_coordinator.storage.state_folder import cluster_of
 
 
-def write_router_config(
-    state: Path,
-    name: str,
-    folder: Path,
-    *,
-    listen: tuple[str, ...],
-    connect: tuple[str, ...],
-    uplink: str = certs.COORDINATOR,
-    admit: tuple[str, ...] = (),
-    installed_at: Path | None = None,
-) -> tuple[Machine, ...]:
-    """Writes `zenohd.json` and `passwords` into the folder of `router/NAME`, and returns the machines it admits.
-
-    `uplink` is the name in the certificate of the peer that it connects to. `admit` lists identities, such as
-    `worker/gpu-7`; empty: every worker, gateway and operator that the coordinator admits now. `installed_at` is the
-    folder's path on the router's host, if it differs. Raises ConfigError for a name that was not issued, or is
-    revoked.
-    """
-    known = {machine.identity: machine for machine in Machines(state).admitted()}
-    own = known.get(f"router/{name}")
-    if own is None:
-        raise ConfigError(
-            f"router/{name} is not admitted: evopolicy-coordinator certs issue router {name} --host ITS_ADDRESS"
-            f" --out {folder}"
-        )
-    for identity in (*admit, *(() if uplink == certs.COORDINATOR else (uplink,))):
-        if identity not in known:
-            raise ConfigError(f"{identity!r} is not admitted; there are: {', '.join(known)}")
-    if not (folder / "key.pem").exists():
-        raise ConfigError(f"{folder} is not the folder of router/{name}: it has no key.pem")
-    admitted = tuple(
-        machine
-        for machine in known.values()
-        if (machine.identity in admit if admit else machine.role != "router")
-    )
-    there = (installed_at or folder).absolute()
-    settings = transport.site_router_settings(
-        cluster_of(state, None),
-        listen,
-        there / "passwords",
-        [(machine.role, machine.identity) for machine in admitted],
-        TlsFiles(
-            root_ca=str(there / "ca.pem"),
-            certificate=str(there / "cert.pem"),
-            private_key=str(there / "key.pem"),
-        ),
-        connect,
-        uplink,
-        own.identity,
-        own.password,
-    )
-    write_passwords(folder / "passwords", admitted)
-    write_atomically(
-        folder / "zenohd.json", json.dumps(nested(settings), indent=2).encode() + b"\n", mode=0o600
-    )
-    return admitted
-
-
-def nested(settings: Mapping[str, Any]) -> dict[str, Any]:
+def _nested(settings: Mapping[str, Any]) -> dict[str, Any]:
     """Converts settings by key, such as `listen/endpoints`, to the tree of a configuration file."""
     tree: dict[str, Any] = {}
     for key, value in settings.items():
@@ -136,16 +78,39 @@ def router_config(
     Write it again, and restart zenohd, whenever a machine of the site is issued or revoked.
     """
     root = state or default_state_dir()
-    admitted = write_router_config(
-        root,
-        name,
-        folder,
-        listen=tuple(listen or ()) or (f"tls/0.0.0.0:{PORT}",),
-        connect=tuple(connect or ()) or (first_endpoint(root),),
-        uplink=uplink,
-        admit=tuple(admit or ()),
-        installed_at=installed_at,
+    upstream = tuple(connect or (first_endpoint(root),))
+    known = {machine.identity: machine for machine in Machines(root).admitted()}
+    own = known.get(f"router/{name}")
+    if own is None:
+        raise ConfigError(
+            f"router/{name} is not admitted: evopolicy-coordinator certs issue router {name} --host ITS_ADDRESS"
+            f" --out {folder}"
+        )
+    for identity in (*(admit or ()), *(() if uplink == certs.COORDINATOR else (uplink,))):
+        if identity not in known:
+            raise ConfigError(f"{identity!r} is not admitted; there are: {', '.join(known)}")
+    if not (folder / "key.pem").exists():
+        raise ConfigError(f"{folder} is not the folder of router/{name}: it has no key.pem")
+    admitted = tuple(
+        machine
+        for machine in known.values()
+        if (machine.identity in admit if admit else machine.role != "router")
     )
     there = (installed_at or folder).absolute()
+    files = {"root_ca": "ca.pem", "certificate": "cert.pem", "private_key": "key.pem"}
+    settings = transport.site_router_settings(
+        cluster_of(root, None),
+        tuple(listen or (f"tls/0.0.0.0:{PORT}",)),
+        there / "passwords",
+        [(machine.role, machine.identity) for machine in admitted],
+        TlsFiles(**{each: str(there / file) for each, file in files.items()}),
+        upstream,
+        uplink,
+        own.identity,
+        own.password,
+    )
+    write_passwords(folder / "passwords", admitted)
+    content = json.dumps(_nested(settings), indent=2).encode() + b"\n"
+    write_atomically(folder / "zenohd.json", content, mode=0o600)
     say(f"{folder}/zenohd.json lets in: {', '.join(one.identity for one in admitted) or 'nobody'}")
     say(f"there: zenohd --config {there}/zenohd.json --rest-http-port none --adminspace-permissions none")

@@ -94,27 +94,29 @@ def web(
     from evopolicy_coordinator.web.access import Access, Tokens, kept_tokens
     from evopolicy_coordinator.web.app import Site, listen, serve
 
-    host, port = _address(http)
-    if (tls_certificate is None) != (tls_key is None):
-        raise ConfigError("give --tls-certificate and --tls-key together")
+    host, port = credentials.host_and_port(
+        "--http", http, f"127.0.0.1:{DEFAULT_PORT}; port 0 takes a free one"
+    )
     for path in (tls_certificate, tls_key, report):
         if path is not None and not path.exists():
             raise ConfigError(f"{path} does not exist")
     if tls_certificate is not None and tls_key is not None:
         _check_certificate(tls_certificate, tls_key)
+    elif tls_certificate is not None or tls_key is not None:
+        raise ConfigError("give --tls-certificate and --tls-key together")
     for folder in runs or ():
         if not folder.is_dir():
             raise ConfigError(f"{folder} is not a folder; name a folder of runs, such as runs")
     roots = runs or [folder for folder in (Path("runs"),) if folder.is_dir()]
     tokens = Tokens.drawn() if token_file is None else kept_tokens(token_file)
-    found = _credentials(tuple(connect or ()), file)
+    known = _credentials(tuple(connect or ()), file)
     book = (action_log or credentials.state_home() / "web-actions.jsonl") if act else None
     if book is not None:
         check_writable(book.parent, "--action-log")
     with announcing(url_file) as announce, listen(host, port) as sock:
-        if found is not None and not (connect or file) and not asyncio.run(_is_reachable(found)):
+        if known is not None and not (connect or file) and not asyncio.run(_is_reachable(known)):
             say("this machine's coordinator does not answer: the folders alone are shown", err=True)
-            found = None
+            known = None
         port = sock.getsockname()[1]
         shown = "127.0.0.1" if host in ("0.0.0.0", "::") else host
         scheme = "http" if tls_certificate is None else "https"
@@ -122,12 +124,10 @@ def web(
         site = Site(
             roots,
             Access(tokens, acting=act, names=[host, *(name or ())], cookie=f"evopolicy_{port}"),
-            credentials=found,
+            credentials=known,
             report=report,
             action_log=book,
-            title=", ".join(
-                root.name or str(root) for root in [each.resolve() for each in roots or [Path.cwd()]]
-            ),
+            title=", ".join(each.resolve().name or "/" for each in roots or [Path.cwd()]),
         )
 
         def ready() -> None:
@@ -161,10 +161,10 @@ def _check_certificate(certificate: Path, key: Path) -> None:
         ) from error
 
 
-async def _is_reachable(found: Credentials) -> bool:
+async def _is_reachable(own: Credentials) -> bool:
     """Whether this machine's coordinator answers."""
     try:
-        async with asyncio.timeout(_REACH_S), transport.connect(found) as link:
+        async with asyncio.timeout(_REACH_S), transport.connect(own) as link:
             await OperatorClient(link).status()
     except (EvopolicyError, TimeoutError):
         return False
@@ -179,13 +179,3 @@ def _credentials(connect: tuple[str, ...], file: Path | None) -> Credentials | N
         if connect or file:
             raise
         return None
-
-
-def _address(http: str) -> tuple[str, int]:
-    host, colon, port = http.rpartition(":")
-    host = host.removeprefix("[").removesuffix("]")
-    if not colon or not host or not port.isdecimal() or int(port) >= 1 << 16:
-        raise ConfigError(
-            f"--http {http!r}: use the form HOST:PORT, such as 127.0.0.1:{DEFAULT_PORT}; port 0 takes a free one"
-        )
-    return host, int(port)

@@ -64,107 +64,100 @@ def accept_worlds(
         raise ConfigError(f"{others[0]} has no worlds; those of Core16 have some: {', '.join(core16)}")
     with held(root):
         secret = splits.load_or_create_secret(root / splits.SECRET)
-        run_to_end(_accept(env_ids, policies, _Journal(root / worlds.JOURNAL, secret), slots))
+        run_to_end(_accept(env_ids, policies, root / worlds.JOURNAL, secret, slots))
     say(f"next: evopolicy-coordinator --state {root}")
 
 
-class _Journal:
-    """The journal, as one epoch sees it."""
-
-    def __init__(self, path: Path, secret: bytes) -> None:
-        self.path, self.secret, self.epoch = path, secret, epoch_of(secret)
-
-    def of(self, env: str) -> list[worlds.Entry]:
-        return worlds.of_environment(worlds.read(self.path), self.epoch, env)
-
-    def add(self, entry: worlds.Entry) -> None:
-        worlds.append(self.path, entry)
-        if isinstance(entry, worlds.Base):
-            scores = f"random {number(entry.random)}, policy {number(entry.canonical)}"
-            say(f"{entry.env}: {scores if entry.policy else 'no policy is known, so no world is accepted'}")
-        else:
-            verdict = "accepted" if entry.accepted else "rejected"
-            scores = f"policy {number(entry.canonical)}, ceiling {number(entry.ceiling)}"
-            say(f"{entry.env}, candidate {entry.number}: {verdict} ({scores})")
-
-
-async def _accept(env_ids: list[str], policies: Path, journal: _Journal, slots: int) -> None:
+async def _accept(env_ids: list[str], policies: Path, journal: Path, secret: bytes, slots: int) -> None:
     end_on_sigterm()
     began = time.monotonic()
     with scratch_folder("worlds") as data:
         async with local_cluster("accept-worlds", data=data) as cluster:
             offered = [each for env in env_ids for each in (env, ids(env)[0])]
             await cluster.start_workers(offered, slots=slots, tiers={"bwrap"})
-            found = credentials.find("operator", (), cluster.operator_file)
-            async with transport.connect(found) as link:
-                player = _Player(Evaluations(link, lambda _, __: None, own=True), data, journal.secret)
+            operator = credentials.find("operator", (), cluster.operator_file)
+            async with transport.connect(operator) as link:
+                trials = _Trials(journal, secret, data, Evaluations(link, lambda _, __: None, own=True))
 
                 async def work() -> None:
                     for env in env_ids:
-                        await _environment(env, catalogue.policy_folder(policies, env), journal, player)
+                        await trials.environment(env, catalogue.policy_folder(policies, env))
 
                 await unless_failed(asyncio.create_task(work()), cluster.failed)
     say(f"{counted(len(env_ids), 'environment')} in {time.monotonic() - began:.0f} s")
 
 
-async def _environment(env: str, folder: Path, journal: _Journal, player: _Player) -> None:
-    policy = snapshot(folder) if (folder / "policy.py").is_file() else None
-    digest = policy.digest if policy else ""
-    entries = journal.of(env)
-    if not entries:
-        new = worlds.Base(epoch=journal.epoch, env=env, policy=digest)
-        if policy is not None:
-            scores = [await player.mean(env, each, "") for each in (None, policy)]
-            new = msgspec.structs.replace(new, random=scores[0], canonical=scores[1])
-        journal.add(new)
-        entries = [new]
-    base, tried = entries[0], [each for each in entries if isinstance(each, worlds.Candidate)]
-    assert isinstance(base, worlds.Base)
-    if base.policy != digest:
-        raise ConfigError(
-            f"{folder} is not the policy with which this epoch's candidates of {env} are tried"
-            f" ({base.policy[:16] or 'none'}): restore it"
+class _Trials:
+    """The trials of one epoch's candidates: their journal, and evaluations on the command's own cluster, all on the
+    same cases of an environment."""
+
+    def __init__(self, journal: Path, secret: bytes, data: Path, evaluations: Evaluations) -> None:
+        self._journal, self._secret, self._epoch = journal, secret, epoch_of(secret)
+        self._data, self._evaluations = data, evaluations
+
+    async def environment(self, env: str, folder: Path) -> None:
+        """Tries candidates of an environment until enough are accepted."""
+        policy = snapshot(folder) if (folder / "policy.py").is_file() else None
+        digest = policy.digest if policy else ""
+        entries = worlds.of_environment(worlds.read(self._journal), self._epoch, env)
+        if not entries:
+            new = worlds.Base(epoch=self._epoch, env=env, policy=digest)
+            if policy is not None:
+                scores = [await self._mean(env, each, "") for each in (None, policy)]
+                new = msgspec.structs.replace(new, random=scores[0], canonical=scores[1])
+            worlds.append(self._journal, new)
+            scores_text = f"random {number(new.random)}, policy {number(new.canonical)}"
+            say(f"{env}: {scores_text if policy else 'no policy is known, so no world is accepted'}")
+            entries = [new]
+        base, tried = entries[0], [each for each in entries if isinstance(each, worlds.Candidate)]
+        assert isinstance(base, worlds.Base)
+        if base.policy != digest:
+            raise ConfigError(
+                f"{folder} is not the policy with which this epoch's candidates of {env} are tried"
+                f" ({base.policy[:16] or 'none'}): restore it"
+            )
+        while policy and len(tried) < worlds.CANDIDATES and sum(each.accepted for each in tried) < N_WORLDS:
+            one = await self._candidate(base, policy, len(tried))
+            worlds.append(self._journal, one)
+            verdict = "accepted" if one.accepted else "rejected"
+            scores_text = f"policy {number(one.canonical)}, ceiling {number(one.ceiling)}"
+            say(f"{env}, candidate {one.number}: {verdict} ({scores_text})")
+            tried.append(one)
+
+    async def _candidate(self, base: worlds.Base, policy: Bundle, n: int) -> worlds.Candidate:
+        world, key = ids(base.env)[0], worlds.key_of(self._secret, base.env, n)
+        canonical = await self._mean(world, policy, key)
+        ceiling, variants = None, 0
+        if worlds.loses(base, canonical):
+            described = await self._description(world)
+            names = tuple(described.definition.get("parameters", ()))
+            rules = Rules(key, described.obs_space, described.action_space, names)
+            for variants in range(1, 2 + (worlds.VARIANTS if PARAMETERS in rules.kinds else 0)):
+                variant = transformed(varied(policy, variants - 1), rules)
+                mean = await self._mean(world, variant, key)
+                ceiling = mean if ceiling is None else max(mean, ceiling)
+                if worlds.reaches(base, ceiling):
+                    break
+        return worlds.Candidate(
+            epoch=base.epoch,
+            env=base.env,
+            number=n,
+            canonical=canonical,
+            ceiling=ceiling,
+            variants=variants,
+            accepted=ceiling is not None and worlds.reaches(base, ceiling),
         )
-    while policy and len(tried) < worlds.CANDIDATES and sum(each.accepted for each in tried) < N_WORLDS:
-        tried.append(await _candidate(base, policy, len(tried), journal, player))
-        journal.add(tried[-1])
 
-
-async def _candidate(
-    base: worlds.Base, policy: Bundle, n: int, journal: _Journal, player: _Player
-) -> worlds.Candidate:
-    world, key = ids(base.env)[0], worlds.key_of(journal.secret, base.env, n)
-    canonical = await player.mean(world, policy, key)
-    ceiling, variants = None, 0
-    if worlds.loses(base, canonical):
-        described = await player.description(world)
-        names = tuple(described.definition.get("parameters", ()))
-        rules = Rules(key, described.obs_space, described.action_space, names)
-        for variants in range(1, 2 + (worlds.VARIANTS if PARAMETERS in rules.kinds else 0)):
-            variant = transformed(varied(policy, variants - 1), rules)
-            ceiling = max(await player.mean(world, variant, key), -math.inf if ceiling is None else ceiling)
-            if worlds.reaches(base, ceiling):
-                break
-    return worlds.Candidate(
-        epoch=base.epoch,
-        env=base.env,
-        number=n,
-        canonical=canonical,
-        ceiling=ceiling,
-        variants=variants,
-        accepted=ceiling is not None and worlds.reaches(base, ceiling),
-    )
-
-
-class _Player:
-    """Evaluations on the command's own cluster, all on the same cases of an environment."""
-
-    def __init__(self, evaluations: Evaluations, data: Path, secret: bytes) -> None:
-        self._evaluations, self._data, self._secret = evaluations, data, secret
-
-    async def mean(self, env: str, bundle: Bundle | None, key: str) -> float:
+    async def _mean(self, env: str, bundle: Bundle | None, key: str) -> float:
         """Mean return of a policy, or of random actions, in an environment or in a world with a key."""
-        self._write(env, key)
+        # The coordinator reads the files of the cases at each request.
+        derived = splits.derive(self._secret, "acceptance", unchanged(env), _COUNTS)
+        folder = self._data / catalogue.folder_name(env)
+        folder.mkdir(exist_ok=True)
+        for split, cases in splits.in_world(env, key, derived).items():
+            stem = split_files.FILE_STEMS[split]
+            content = split_files.SplitFile(env=env, split=stem, cases=cases, secret=True)
+            write_atomically(folder / f"{stem}.json", msgspec.json.encode(content), mode=0o600)
         if bundle is not None:
             await self._evaluations.ask.upload(bundle.digest, bundle.packed)
         message = Evaluate(
@@ -178,17 +171,7 @@ class _Player:
         returns = [float(each.episode_return) async for each in self._evaluations.outcomes(message)]
         return math.fsum(returns) / len(returns)
 
-    async def description(self, world: str) -> EnvironmentDescription:
+    async def _description(self, world: str) -> EnvironmentDescription:
         await self._evaluations.versions(DescribeEnvironment(env=world), wait=True)
         offered, *_ = await self._evaluations.ask.environments()
         return next(each.description for each in offered if each.description.env == world)
-
-    def _write(self, env: str, key: str) -> None:
-        """The files of the cases, which the coordinator reads at each request."""
-        derived = splits.derive(self._secret, "acceptance", unchanged(env), _COUNTS)
-        folder = self._data / catalogue.folder_name(env)
-        folder.mkdir(exist_ok=True)
-        for split, cases in splits.in_world(env, key, derived).items():
-            stem = split_files.FILE_STEMS[split]
-            content = split_files.SplitFile(env=env, split=stem, cases=cases, secret=True)
-            write_atomically(folder / f"{stem}.json", msgspec.json.encode(content), mode=0o600)

@@ -54,13 +54,13 @@ from evopolicy_coordinator.core.contract.records import (
 )
 from evopolicy_coordinator.pki import identity
 from evopolicy_coordinator.server.reason_texts import env_failure, operator_words, words
+from evopolicy_coordinator.server.request_checks import MAX_COUNT, finite_cursor, require
 from evopolicy_coordinator.server.uploads import Uploads
 from evopolicy_coordinator.storage.store import Reader
 
 log: structlog.stdlib.BoundLogger = structlog.get_logger()
 
 MAX_PAGE_BYTES = 1 << 20
-MAX_SEQ = 2**31 - 1
 _READERS = 2
 _BLOB_LANES = 4
 _NO_BYTES = BlobRef(digest=digest_of(b""), size=0, inline=b"")
@@ -127,19 +127,16 @@ class ServiceReader:
 
         Raises RefusedError for a run that is unknown, unfinished, or has no commitment.
         """
-        epochs: dict[str, None] = {}
-        for run in runs:
-            row = self.finished_run(run)
+        rows = {run: self.finished_run(run) for run in runs}
+        for run, row in rows.items():
             if row is None:
                 raise RefusedError(Refusal.UNKNOWN_RUN, f"there is no finished run {run[:64]!r} here")
-            if row.committed is None:
-                raise RefusedError(
-                    Refusal.BAD_REQUEST,
-                    f"run {run} was opened before this coordinator kept a journal: it has no commitment to its cases,"
-                    " which cannot be added later, so it cannot be published",
-                )
-            epochs[row.epoch] = None
-        return tuple(epochs)
+            text = (
+                f"run {run} was opened before this coordinator kept a journal: it has no commitment to its cases,"
+                " which cannot be added later, so it cannot be published"
+            )
+            require(row.committed is not None, Refusal.BAD_REQUEST, text)
+        return tuple(dict.fromkeys(row.epoch for row in rows.values() if row is not None))
 
     def finished_with_result(self, run: str) -> tuple[RunRow, RunFinished]:
         """A finished run and its result. Reads the database. Raises RefusedError for any other run."""
@@ -231,16 +228,14 @@ class ServiceReader:
     def _finished(self, effect: ReadFinished) -> Message:
         finished = self._reader.finished(effect.run)
         if finished is None:
-            return Refused(status=Refusal.UNKNOWN_RUN, message=f"run {effect.run!r} has no outcome")
+            raise RefusedError(Refusal.UNKNOWN_RUN, f"run {effect.run!r} has no outcome")
         done = len(finished.heldout_returns)
         return RunProgress(phase="finished", done=done, total=done, finished=finished)
 
     def _results(self, effect: ReadResults) -> Message:
         row = self._reader.one(SubmitRow, run=effect.run, submit_index=effect.submit_index)
         if row is None:
-            return Refused(
-                status=Refusal.UNKNOWN_SUBMIT, message=f"this run has no submit {effect.submit_index}"
-            )
+            raise RefusedError(Refusal.UNKNOWN_SUBMIT, f"this run has no submit {effect.submit_index}")
         # The row may have changed since the core's request. An end is reported with all episodes that belong before
         # it.
         upto = row.released if effect.upto is None or row.status is not None else effect.upto
@@ -271,23 +266,20 @@ class ServiceReader:
         )
 
     def _recorded(self, message: RecordedRequest) -> Message:
-        run = message.run
-        if self._reader.finished(run) is None:
-            return Refused(status=Refusal.UNKNOWN_RUN, message=f"there is no finished run {run[:64]!r} here")
-        index = message.submit_index
+        run, index, cursor = message.run, message.submit_index, finite_cursor(message.cursor)
+        finished = self._reader.finished(run) is not None
+        require(finished, Refusal.UNKNOWN_RUN, f"there is no finished run {run[:64]!r} here")
         group = records.random_group(run) if index < 0 else records.GROUPS[message.split](run, index)
-        cursor = min(max(0, message.cursor), MAX_SEQ)
-        page = self._reader.outcomes(group, cursor, MAX_SEQ, MAX_PAGE_BYTES)
+        page = self._reader.outcomes(group, cursor, MAX_COUNT, MAX_PAGE_BYTES)
         after = _after(page, cursor)
         outcomes = tuple(each.outcome for each in page)
         return EvaluationPage(cursor=after, total=after, outcomes=outcomes, finished=not page)
 
     def _journal(self, message: JournalRequest) -> Message:
-        cursor = min(max(0, message.cursor), MAX_SEQ)
+        cursor = finite_cursor(message.cursor)
         rows = self._reader.journal(cursor, MAX_PAGE_BYTES)
-        return JournalPage(
-            cursor=_after(rows, cursor), entries=tuple(row.entry for row in rows), finished=not rows
-        )
+        entries = tuple(row.entry for row in rows)
+        return JournalPage(cursor=_after(rows, cursor), entries=entries, finished=not rows)
 
     def _opening(self, message: OpeningRequest) -> Message:
         row = self.finished_run(message.run)
@@ -296,17 +288,14 @@ class ServiceReader:
         )
         if row is None or opening is None or result is None:
             text = f"there is no finished run {message.run[:64]!r} here that was committed to"
-            return Refused(status=Refusal.UNKNOWN_RUN, message=text)
-        if row.epoch not in self._reader.revealed():
-            text = f"the cases of run {row.run} are not disclosed; publish it first"
-            return Refused(status=Refusal.BAD_REQUEST, message=text)
+            raise RefusedError(Refusal.UNKNOWN_RUN, text)
+        text = f"the cases of run {row.run} are not disclosed; publish it first"
+        require(row.epoch in self._reader.revealed(), Refusal.BAD_REQUEST, text)
         return RunOpening(salt=row.salt, opening=opening.data, result=result.data)
 
     def _sign(self, message: SignRequest) -> Message:
-        if not is_digest(message.digest):
-            return Refused(
-                status=Refusal.BAD_REQUEST, message=f"{message.digest[:80]!r} is no SHA-256 digest"
-            )
+        text = f"{message.digest[:80]!r} is no SHA-256 digest"
+        require(is_digest(message.digest), Refusal.BAD_REQUEST, text)
         key, signature = identity.sign(self.state, message.digest)
         return Signed(key=key, signature=signature)
 
@@ -318,12 +307,10 @@ class ServiceReader:
         max_bytes: int,
         submitted: Collection[str | None],
     ) -> Message:
-        if not is_digest(message.digest):
-            return Refused(status=Refusal.BAD_BLOB, message=f"{message.digest[:80]!r} is no SHA-256 digest")
-        if not 0 <= message.size <= max_bytes:
-            return Refused(
-                status=Refusal.BAD_BLOB, message=f"blob of {message.size:,} bytes, {max_bytes:,} are allowed"
-            )
+        text = f"{message.digest[:80]!r} is no SHA-256 digest"
+        require(is_digest(message.digest), Refusal.BAD_BLOB, text)
+        text = f"blob of {message.size:,} bytes, {max_bytes:,} are allowed"
+        require(0 <= message.size <= max_bytes, Refusal.BAD_BLOB, text)
         if run is not None:
             self._uploads.begin(run, message.digest, message.size, submitted)
         on_whole = None
@@ -336,17 +323,15 @@ class ServiceReader:
         except StorageError as error:
             if error.__cause__ is not None:  # the disk's fault, not the sender's
                 raise
-            return Refused(status=Refusal.BAD_BLOB, message=str(error))
+            raise RefusedError(Refusal.BAD_BLOB, str(error)) from error
         return BlobAck(have=have)
 
     def _get(self, run: str | None, message: BlobGet) -> Message:
         known = is_digest(message.digest) and (run is None or self._reader.names_blob(run, message.digest))
-        if not known or not self._blobs.has(message.digest):
-            return Refused(status=Refusal.UNKNOWN_BLOB, message=f"no blob {message.digest[:80]!r} here")
-        size = self._blobs.size(message.digest)
-        return BlobChunk(
-            size=size, data=self._blobs.read_chunk(message.digest, max(0, message.offset), codec.CHUNK_BYTES)
-        )
+        text = f"no blob {message.digest[:80]!r} here"
+        require(known and self._blobs.has(message.digest), Refusal.UNKNOWN_BLOB, text)
+        data = self._blobs.read_chunk(message.digest, max(0, message.offset), codec.CHUNK_BYTES)
+        return BlobChunk(size=self._blobs.size(message.digest), data=data)
 
 
 _READS: dict[type, Callable[[ServiceReader, Any], Message]] = {

@@ -10,7 +10,7 @@ import msgspec
 
 from evopolicy_common import catalogue
 from evopolicy_common.errors import RefusedError
-from evopolicy_common.messages import gateway, operator, worker
+from evopolicy_common.messages import gateway, worker
 from evopolicy_common.messages.environment import Case
 from evopolicy_common.messages.episode import LARGEST_LIMIT, LARGEST_LIMITS, BlobRef, ResourceLimits, Tier
 from evopolicy_common.processes.packages import POLICY
@@ -79,26 +79,6 @@ def bounded_close(message: gateway.CloseRun) -> gateway.CloseRun:
     return msgspec.structs.replace(message, reason=message.reason[:MAX_REASON], agent=agent)
 
 
-def check_open(message: gateway.OpenRun) -> None:
-    """Checks that the gateway can read rendered episodes."""
-    text = (
-        "this gateway is of an earlier version, which cannot read the present reports of workers: install the"
-        " coordinator's version of evopolicy on the agent's host"
-    )
-    require(message.reads_rendered, Refusal.WRONG_PROTOCOL, text)
-
-
-def check_submit_index(index: int) -> None:
-    """Checks that a submit can have this number."""
-    require(0 <= index <= MAX_COUNT, Refusal.UNKNOWN_SUBMIT, f"this run has no submit {index}")
-
-
-def check_repin(message: operator.RepinRun) -> None:
-    """Checks that the override has a reason."""
-    text = "an override of a run's fingerprint class needs a reason"
-    require(bool(message.reason.strip()), Refusal.BAD_MESSAGE, text)
-
-
 def check_stored(blobs: BlobStore, ref: BlobRef) -> None:
     """Checks that the blob is stored, with the announced size."""
     text = f"blob {ref.digest[:64]!r} is not stored here; upload it first"
@@ -119,11 +99,6 @@ def check_token(expected: str, given: str) -> None:
     """Compares the token with the expected one, in constant time."""
     text = "invalid token, or unknown run, worker or evaluation; see the credentials file"
     require(hmac.compare_digest(expected.encode(), given.encode()), Refusal.BAD_TOKEN, text)
-
-
-def check_key(tail: str, expected: str) -> None:
-    """Checks that the message came on the key of its kind."""
-    require(tail == expected, Refusal.WRONG_KEY, f"this message belongs on {expected!r}, not on {tail!r}")
 
 
 def check_idempotency_key(key: str) -> None:
@@ -189,17 +164,18 @@ def check_place(boot_id: str, host: str, installation: str = "") -> None:
         require(len(value) <= _MAX_NAME and value.isprintable(), Refusal.BAD_MESSAGE, text)
 
 
-def check_begun(ref: BlobRef | None) -> None:
-    """Checks that a job's stored start state is bounded and fits into a lease."""
+def check_begun(blobs: BlobStore, ref: BlobRef) -> None:
+    """Checks that the actions that a job resumes from are bounded, fit into a lease, and are there."""
     check_inline(ref)
-    if ref is not None:
-        most, inline = codec.MAX_PACKED_BYTES, codec.INLINE_BEGUN_BYTES
-        require(
-            0 < ref.size <= most and len(ref.inline or b"") <= inline,
-            Refusal.BAD_BLOB,
-            f"the recorded actions that a job resumes from take {ref.size:,} bytes; {most:,} are the limit, and"
-            f" inside a message {inline:,}",
-        )
+    most, inline = codec.MAX_PACKED_BYTES, codec.INLINE_BEGUN_BYTES
+    require(
+        0 < ref.size <= most and len(ref.inline or b"") <= inline,
+        Refusal.BAD_BLOB,
+        f"the recorded actions that a job resumes from take {ref.size:,} bytes; {most:,} are the limit, and"
+        f" inside a message {inline:,}",
+    )
+    if ref.inline is None:
+        check_stored(blobs, ref)
 
 
 def check_inline(ref: BlobRef | None) -> None:

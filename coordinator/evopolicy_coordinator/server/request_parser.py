@@ -27,6 +27,7 @@ from evopolicy_coordinator.core.contract.events import AnyEvent, Requested, Work
 from evopolicy_coordinator.pki.machines import Machines
 from evopolicy_coordinator.server import request_checks as checks
 from evopolicy_coordinator.server.definitions import Definitions
+from evopolicy_coordinator.server.request_checks import require
 from evopolicy_coordinator.server.run_requests import RunRequests
 from evopolicy_coordinator.server.uploads import Uploads
 from evopolicy_coordinator.storage.state_folder import Identity
@@ -38,6 +39,13 @@ _DECODERS: dict[str, Any] = {
     "ops": codec.operator_requests,
 }
 """By the first part of a key after the cluster's name."""
+
+
+_OLD_GATEWAY = (
+    "this gateway is of an earlier version, which cannot read the present reports of workers: install the"
+    " coordinator's version of evopolicy on the agent's host"
+)
+_NO_REASON = "an override of a run's fingerprint class needs a reason"
 
 
 class Parsed(msgspec.Struct, frozen=True):
@@ -83,30 +91,27 @@ class RequestParser:
         if subtree not in _DECODERS:
             raise RefusedError(Refusal.WRONG_KEY, f"no request is served on {key}")
         message = codec.decode(_DECODERS[subtree], payload)
-        verb = REQUESTS[type(message)].verb
         is_blob = isinstance(message, BlobPut | BlobGet)
         if subtree == "ops":
-            asker = "operator"
             self._check_token("operator", self._identity.operator_token, message.token)
-        elif subtree == "gw":
-            asker = message.sender if is_blob else message.run
-            checks.check_key(tail, f"{asker}/{verb}")
-            token = capability(asker)
-            checks.check_token(secrets.token_urlsafe(32) if token is None else token, message.token)
-        else:
-            asker = message.sender if is_blob else message.worker
-            checks.check_key(tail, verb)
-            if isinstance(message, worker.Register):
-                self._check_token("worker", self._identity.worker_token, message.token)
-                checks.check_registration(message)
-                checks.check_packages(message, self.runs.allowed_imports)
-            elif self._machines.is_shut_out(message.token if is_blob else message.session):
-                # The core checks whether it knows the session.
-                raise RefusedError(
-                    Refusal.REVOKED,
-                    "the certificate of this machine was revoked or reissued; ask the cluster's operator for a"
-                    " new folder",
-                )
+            return Parsed(subtree, "operator", message)
+        asker = message.sender if is_blob else message.run if subtree == "gw" else message.worker
+        verb = REQUESTS[type(message)].verb
+        expected = f"{asker}/{verb}" if subtree == "gw" else verb
+        text = f"this message belongs on {expected!r}, not on {tail!r}"
+        require(tail == expected, Refusal.WRONG_KEY, text)
+        if subtree == "gw":
+            checks.check_token(capability(asker) or secrets.token_urlsafe(32), message.token)
+        elif isinstance(message, worker.Register):
+            self._check_token("worker", self._identity.worker_token, message.token)
+            checks.check_registration(message)
+            checks.check_packages(message, self.runs.allowed_imports)
+        elif self._machines.is_shut_out(message.token if is_blob else message.session):
+            # The core checks whether it knows the session.
+            raise RefusedError(
+                Refusal.REVOKED,
+                "the certificate of this machine was revoked or reissued; ask the cluster's operator for a new folder",
+            )
         return Parsed(subtree, asker, message)
 
     def _check_token(self, role: Role, local: str, given: str) -> None:
@@ -167,9 +172,8 @@ class RequestParser:
     def _checked_results(self, m: worker.ReportResults) -> worker.ReportResults:
         results = tuple(map(self._unpacked, m.results))
         for result in results:
-            checks.check_begun(result.begun)
-            if result.begun is not None and result.begun.inline is None:
-                checks.check_stored(self._blobs, result.begun)
+            if result.begun is not None:
+                checks.check_begun(self._blobs, result.begun)
             for outcome in result.episodes:
                 for ref in (outcome.trajectory, outcome.video):
                     checks.check_inline(ref)
@@ -182,9 +186,8 @@ class RequestParser:
         if result.packed is None:
             return result
         # Checked before they are read: a blob may have a gigabyte.
-        if result.packed.size > codec.MAX_PACKED_BYTES:
-            text = f"outcomes of {result.packed.size:,} bytes; {codec.MAX_PACKED_BYTES:,} are the limit"
-            raise RefusedError(Refusal.BAD_BLOB, text)
+        size, most = result.packed.size, codec.MAX_PACKED_BYTES
+        require(size <= most, Refusal.BAD_BLOB, f"outcomes of {size:,} bytes; {most:,} are the limit")
         checks.check_stored(self._blobs, result.packed)
         try:
             outcomes = codec.unpack_outcomes(self._blobs.read(result.packed.digest))
@@ -197,8 +200,12 @@ class RequestParser:
         sent = m.bundle is None or self._uploads.has_sent(m.run, m.bundle)
         checks.check_bundle(self._blobs, m.bundle, sent=sent)
         whole = m.rejected is None or bool(m.env_instances)
-        if whole and (m.bundle is None) == (m.bundle_error is None):
-            raise RefusedError(Refusal.BAD_MESSAGE, "a submit has either a bundle or a bundle_error")
+        one = (m.bundle is None) != (m.bundle_error is None)
+        require(one or not whole, Refusal.BAD_MESSAGE, "a submit has either a bundle or a bundle_error")
+
+    def _check_poll(self, m: gateway.ResultsRequest) -> None:
+        index = m.submit_index
+        require(0 <= index <= checks.MAX_COUNT, Refusal.UNKNOWN_SUBMIT, f"this run has no submit {index}")
 
 
 class Request(NamedTuple):
@@ -220,17 +227,21 @@ REQUESTS: dict[type[Message], Request] = {
     worker.ReportResults: Request("done", RequestParser._checked_results),
     BlobPut: Request("blob"),
     BlobGet: Request("blob"),
-    gateway.OpenRun: Request("open", lambda _, m: checks.check_open(m)),
+    gateway.OpenRun: Request(
+        "open", lambda _, m: require(m.reads_rendered, Refusal.WRONG_PROTOCOL, _OLD_GATEWAY)
+    ),
     gateway.RequestPermit: Request("permit", lambda _, m: checks.check_place(m.boot_id, m.host)),
     gateway.StateRequest: Request("state"),
     gateway.Submit: Request("submit", RequestParser._check_submit, creates=True),
-    gateway.ResultsRequest: Request("results", lambda _, m: checks.check_submit_index(m.submit_index)),
+    gateway.ResultsRequest: Request("results", RequestParser._check_poll),
     gateway.CloseRun: Request("close", lambda _, m: checks.bounded_close(m)),
     operator.CreateRun: Request(creates=True),
     operator.Evaluate: Request(creates=True),
     operator.Rescore: Request(creates=True),
     operator.Disclose: Request(creates=True),
-    operator.RepinRun: Request(check=lambda _, m: checks.check_repin(m)),
+    operator.RepinRun: Request(
+        check=lambda _, m: require(bool(m.reason.strip()), Refusal.BAD_MESSAGE, _NO_REASON)
+    ),
 }
 """All kinds of requests."""
 

@@ -18,6 +18,7 @@ import hmac
 import time
 from collections.abc import Awaitable, Callable, Coroutine, Iterator
 from importlib import metadata
+from typing import NamedTuple
 
 import msgspec
 from msgspec.structs import replace
@@ -47,7 +48,6 @@ from evopolicy_coordinator.server.claims import Claims
 from evopolicy_coordinator.server.core_host import CoreHost
 from evopolicy_coordinator.server.definitions import failed, undescribed
 from evopolicy_coordinator.server.monitoring.watchdog import LoopWatchdog
-from evopolicy_coordinator.server.pending import PendingQueries
 from evopolicy_coordinator.server.reader import ServiceReader, answer_bytes, answer_to, damaged, lane_of
 from evopolicy_coordinator.server.reason_texts import message, operator_words, words
 from evopolicy_coordinator.server.refused_workers import RefusedWorkers
@@ -66,6 +66,15 @@ _SWEEP_S = _FORGET_S / 4
 _STALLS_LOGGED = 5
 _READ_AGAIN_S = 3.0
 _CANNOT_WRITE = "the coordinator cannot write its store and accepts no changes until it can"
+
+
+class Pending(NamedTuple):
+    """A query that waits for its reply."""
+
+    query: IncomingQuery
+    asker: str
+    since: float
+    """Monotonic time of its arrival here, seconds."""
 
 
 class Service:
@@ -89,8 +98,10 @@ class Service:
         self._writer = Writer(store)
         self._claims = Claims(self._writer)
         self._refused_workers = RefusedWorkers()
-        self._pending = PendingQueries()
-        self.host = CoreHost(settings, self._writer, self._carry_out, self._pending.let_go)
+        self._pending: dict[int | str, Pending] = {}
+        """By the number under which the core knows the query, oldest first; numbers are never reused."""
+        self._n_requests = 0
+        self.host = CoreHost(settings, self._writer, self._carry_out, self._let_go)
         self._tasks: set[asyncio.Task[None]] = set()
         self._started_at = self.host.now()
         self._watchdog: LoopWatchdog | None = None
@@ -123,7 +134,7 @@ class Service:
             task.cancel()
         await asyncio.gather(*self._tasks, return_exceptions=True)
         await self.host.settle()
-        self._pending.let_go()
+        self._let_go()
         await self._writer.close()
         await asyncio.to_thread(self._reader.close)
         if self._watchdog is not None:
@@ -159,9 +170,14 @@ class Service:
                 parsed = self._parser.parse(query.key, query.payload, core.state.capabilities.get)
                 if parsed.subtree == "gw":
                     self._heard[parsed.asker] = self.host.now()
-                _ANSWERS.get(type(parsed.message), Service._serve_event)(self, core, query, parsed)
+                serve = _ANSWERS.get(type(parsed.message), Service._serve_event)
+                answer = serve(self, core, query, parsed)
             except ProtocolError as error:
                 raise RefusedError(Refusal.BAD_MESSAGE, str(error)) from error
+            if isinstance(answer, Awaitable):
+                self._spawn(self._reply_with(query, answer))
+            elif answer is not None:
+                query.reply(answer_bytes(answer), lane_of(parsed.asker))
 
     def _serve_event(self, core: Core, query: IncomingQuery, parsed: Parsed) -> None:
         """Passes the request to the core, which answers it with an effect."""
@@ -169,11 +185,11 @@ class Service:
         if self._parser.reads_files(message):
             self._spawn(self._serve_from_thread(query, self._pinned(core, parsed)))
             return
-        request = self._pending.admit(query, parsed.asker)
+        request = self._admit(query, parsed.asker)
         try:
             event = self._parser.event(parsed, request, self._stimulus_of(message))
         except BaseException:
-            self._pending.take(request)
+            self._pending.pop(request, None)
             raise
         if isinstance(message, LeaseRequest):
             event = msgspec.structs.replace(event, waited_s=self._loop.time() - query.arrived)
@@ -185,37 +201,29 @@ class Service:
     def _serve_stored(self, core: Core, query: IncomingQuery, parsed: Parsed) -> None:
         self._reader.read(parsed.message, answer_to(query, parsed.asker))
 
-    def _serve_description(self, core: Core, query: IncomingQuery, parsed: Parsed) -> None:
-        read = self._description(core, parsed.message)
-        self._spawn(self._reply_with(query, asyncio.to_thread(read)))
+    async def _serve_further_cases(self, core: Core, query: IncomingQuery, parsed: Parsed) -> Message:
+        return await asyncio.to_thread(self._parser.runs.further_cases, parsed.message)
 
-    def _serve_further_cases(self, core: Core, query: IncomingQuery, parsed: Parsed) -> None:
-        derived = asyncio.to_thread(self._parser.runs.further_cases, parsed.message)
-        self._spawn(self._reply_with(query, derived))
-
-    def _serve_claim(self, core: Core, query: IncomingQuery, parsed: Parsed) -> None:
-        self._spawn(self._reply_with(query, self._claim(parsed.message)))
-
-    async def _claim(self, message: operator.Claim) -> Message:
+    async def _serve_claim(self, core: Core, query: IncomingQuery, parsed: Parsed) -> Message:
         """Serves a claim without the core: claims change no run."""
         try:
-            return await self._claims.ask(message, self.host.now())
+            return await self._claims.ask(parsed.message, self.host.now())
         except DamagedStoreError:
             raise
         except StorageError as error:
             return Refused(status=Refusal.UNAVAILABLE, message=str(error))
 
-    def _serve_environments(self, core: Core, query: IncomingQuery, parsed: Parsed) -> None:
+    def _serve_environments(self, core: Core, query: IncomingQuery, parsed: Parsed) -> Message:
         workers = core.state.workers.values()
         page = _page(self._parser.definitions.offered(workers), parsed.message.cursor)
         if page.finished:
             page = replace(page, undescribed=undescribed(workers), failed=failed(workers))
-        query.reply(answer_bytes(page), lane_of(parsed.asker))
+        return page
 
-    def _serve_approval(self, core: Core, query: IncomingQuery, parsed: Parsed) -> None:
+    def _serve_approval(self, core: Core, query: IncomingQuery, parsed: Parsed) -> Message:
         wanted, workers = parsed.message, core.state.workers.values()
         self._parser.definitions.approve(wanted.env, wanted.digest, workers)
-        query.reply(answer_bytes(operator.Done()), lane_of(parsed.asker))
+        return operator.Done()
 
     def _pinned(self, core: Core, parsed: Parsed) -> Parsed:
         """Returns the request with the environment definition that its episodes are played in."""
@@ -244,13 +252,13 @@ class Service:
 
     async def _serve_from_thread(self, query: IncomingQuery, parsed: Parsed) -> None:
         """Serves requests whose event is built from files."""
-        request = self._pending.admit(query, parsed.asker)
+        request = self._admit(query, parsed.asker)
         stimulus = self._stimulus_of(parsed.message)
         with self._answering(query):
             try:
                 event = await asyncio.to_thread(self._parser.event, parsed, request, stimulus)
             except BaseException:
-                self._pending.take(request)
+                self._pending.pop(request, None)
                 raise
             if request in self._pending:  # otherwise the core was dropped meanwhile, and the query with it
                 self.host.handle(event)
@@ -274,9 +282,9 @@ class Service:
             log.exception("request failed", key=query.key)
             query.drop()
 
-    def _description(self, core: Core, message: operator.DescribeEnvironment) -> Callable[[], Message]:
+    def _serve_description(self, core: Core, query: IncomingQuery, parsed: Parsed) -> Awaitable[Message]:
         """Reads the split hashes and the fingerprints that matter for replaying a run's episodes."""
-        workers = core.state.workers.values()
+        message, workers = parsed.message, core.state.workers.values()
         profiles = {
             repr(each.profile.fingerprints[message.env]): each.profile
             for each in workers
@@ -290,7 +298,7 @@ class Service:
         if awaited:
             self.host.handle(DescriptionAwaited(stimulus_id=self._stimulus_of(message), env=message.env))
 
-        def read() -> operator.EnvironmentState:
+        def read() -> Message:
             row = self._reader.finished_run(message.run)
             return operator.EnvironmentState(
                 split_hashes=self._parser.runs.split_hashes(message, row),
@@ -301,7 +309,7 @@ class Service:
                 result=b"" if row is None else self._reader.result(message.run),
             )
 
-        return read
+        return asyncio.to_thread(read)
 
     def _serve_put(self, core: Core, query: IncomingQuery, parsed: Parsed) -> None:
         message = parsed.message
@@ -411,9 +419,23 @@ class Service:
     def _stimulus_of(self, message: Message) -> str:
         return self._stimulus(type(message).__name__.lower())
 
-    def _stimulus(self, what: str) -> str:
+    def _stimulus(self, kind: str) -> str:
         self._n_events += 1
-        return f"{what}-{self.host.incarnation}.{self._n_events}"
+        return f"{kind}-{self.host.incarnation}.{self._n_events}"
+
+    def _admit(self, query: IncomingQuery, asker: str) -> int:
+        """Lets a query wait for the core, and returns its number."""
+        self._n_requests += 1
+        self._pending[self._n_requests] = Pending(query, asker, time.monotonic())
+        return self._n_requests
+
+    def _let_go(self, older_than_s: float = 0.0) -> None:
+        """Drops, without a reply, queries that have waited at least `older_than_s` seconds; by default all."""
+        for request, pending in list(self._pending.items()):
+            if time.monotonic() - pending.since < older_than_s:
+                return
+            pending.query.drop()
+            del self._pending[request]
 
     # Effects out.
 
@@ -425,16 +447,17 @@ class Service:
             log.exception("cannot carry out", effect=type(effect).__name__)
 
     def _carried_out(self, effect: Effect) -> None:
-        if isinstance(effect, Reply | Refuse):
-            pending = self._pending.take(effect.request)
-            if pending is not None:
-                query, reply = pending.query, message(effect, self._reader.state)
-                self._refused_workers.answered(query.key, query.payload, reply, self.host.now())
-                query.reply(answer_bytes(reply), lane_of(pending.asker))
-        elif isinstance(effect, ReadEffect):
-            pending = self._pending.take(effect.request)
-            if pending is not None:
-                self._reader.read(effect, answer_to(pending.query, pending.asker))
+        if isinstance(effect, Reply | Refuse | ReadEffect):
+            pending = self._pending.pop(effect.request, None)
+            if pending is None:
+                return
+            query, answer = pending.query, answer_to(pending.query, pending.asker)
+            if isinstance(effect, ReadEffect):
+                self._reader.read(effect, answer)
+                return
+            reply = message(effect, self._reader.state)
+            self._refused_workers.answered(query.key, query.payload, reply, self.host.now())
+            answer(reply)
         elif isinstance(effect, AuditEffect):
             soon, incarnation = self._loop.call_soon_threadsafe, self.host.incarnation
             self._reader.audit(effect, lambda event: soon(self._audited, incarnation, event))
@@ -451,7 +474,7 @@ class Service:
         """Periodically drops queries without a waiter (queries of lost workers are never answered), and uploads of runs
         that are over."""
         self._sweeper = self._loop.call_later(_SWEEP_S, self._sweep)
-        self._pending.let_go(_FORGET_S)
+        self._let_go(_FORGET_S)
         self._tell_stalls()
         self._spawn(self._measure_disk())
         core = self.host.core
@@ -487,7 +510,10 @@ class Service:
         )
 
 
-_ANSWERS: dict[type[Message], Callable[[Service, Core, IncomingQuery, Parsed], None]] = {
+Answered = Message | Awaitable[Message] | None
+"""A reply; None: it is sent later."""
+
+_ANSWERS: dict[type[Message], Callable[[Service, Core, IncomingQuery, Parsed], Answered]] = {
     BlobPut: Service._serve_put,
     BlobGet: Service._serve_get,
     operator.Claim: Service._serve_claim,

@@ -27,6 +27,7 @@ from starlette.types import ASGIApp
 
 from evopolicy_common.errors import ConfigError, EvopolicyError
 from evopolicy_common.logs import structlog
+from evopolicy_common.messages.status import StatusReply
 from evopolicy_common.wire.credentials import Credentials
 from evopolicy_common.wire.http import bound, serving
 from evopolicy_coordinator.server.monitoring.metrics import CONTENT_TYPE, StatusCollector
@@ -44,7 +45,7 @@ from evopolicy_coordinator.web.views.run import episode_values, run_view, submit
 from evopolicy_coordinator.web.views.sweeps import sweeps_view
 
 _FORM_WAIT_S = 10.0
-_LOOK_S = 1.0
+_SCAN_S = 1.0
 """Minimum pause between two scans of the folders."""
 _SHARE = 20.0
 """The pause is also at least this multiple of the last scan's duration."""
@@ -94,9 +95,9 @@ class Site:
         self.book = None if action_log is None else acting.Log(action_log)
         self.cluster: Cluster | None = None
         self._moved = asyncio.Event()
-        self._looked_at = float("-inf")
-        self._looking = asyncio.Lock()
-        self._took_s = 0.0
+        self._scanned_at = float("-inf")
+        self._scanning = asyncio.Lock()
+        self._scan_s = 0.0
         self._registry = CollectorRegistry()
         ProcessCollector(registry=self._registry)
         browsers = Gauge("evopolicy_web_browsers", "Browsers that follow a page.", registry=self._registry)
@@ -107,10 +108,9 @@ class Site:
 
     @contextlib.asynccontextmanager
     async def running(self) -> AsyncIterator[None]:
-        """Looks and tells inside the `async with`."""
-        tasks = [asyncio.create_task(self._tell())]
-        if self.cluster is not None:
-            tasks.append(asyncio.create_task(self.cluster.run()))
+        """Keeps the data and the open pages up to date inside the `async with`."""
+        work = [self._tell()] if self.cluster is None else [self._tell(), self.cluster.run()]
+        tasks = list(map(asyncio.create_task, work))
         try:
             yield
         finally:
@@ -118,25 +118,29 @@ class Site:
                 task.cancel()
             await asyncio.gather(*tasks, return_exceptions=True)
 
+    @property
+    def status(self) -> StatusReply | None:
+        """The coordinator's last status."""
+        return None if self.cluster is None else self.cluster.status
+
     async def refresh(self) -> None:
         """Reads the folders anew, unless that was just done."""
         if self.cluster is not None:
             self.cluster.wake()
-        async with self._looking:
-            if time.monotonic() - self._looked_at < max(_LOOK_S, _SHARE * self._took_s):
-                return
+        async with self._scanning:
             began = time.monotonic()
+            if began - self._scanned_at < max(_SCAN_S, _SHARE * self._scan_s):
+                return
             known = self.cluster is None or self.cluster.is_known
-            status = None if self.cluster is None else self.cluster.status
-            open_runs = () if status is None else status.runs
+            open_runs = () if self.status is None else self.status.runs
             self.runs = await asyncio.to_thread(self.reader.read, open_runs, cluster_is_known=known)
-            self._looked_at = time.monotonic()
-            self._took_s = self._looked_at - began
+            self._scanned_at = time.monotonic()
+            self._scan_s = self._scanned_at - began
 
     async def _tell(self) -> None:
         """Updates the open pages."""
         while True:
-            await set_within(self._moved, _LOOK_S)
+            await set_within(self._moved, _SCAN_S)
             self._moved.clear()
             try:
                 if self.feeds.watchers:
@@ -144,7 +148,7 @@ class Site:
                 for feed, view in self.feeds.watched():
                     feed.update(await asyncio.to_thread(view))
             except Exception:
-                # Of one moment's files: the next look finds others.
+                # Files may change while they are read; the next scan reads them again.
                 log.exception("a page could not be updated")
             await asyncio.sleep(0.5)
 
@@ -163,11 +167,9 @@ class Site:
 
         def view() -> rendering.View:
             run = self.runs.by_key[key]
-            status = None if cluster is None else cluster.status
             retries = () if cluster is None else tuple(cluster.retries.get(run.run, ()))
-            return run_view(
-                run, self.runs, self.reader, words, acting=may_act, status=status, retries=retries
-            )
+            about: dict[str, Any] = {"acting": may_act, "status": self.status, "retries": retries}
+            return run_view(run, self.runs, self.reader, words, **about)
 
         return view
 
@@ -203,16 +205,9 @@ class Site:
         make = self.view_of(name, words, may_act=may_act)
         view = await asyncio.to_thread(make)
         feed = self.feeds.of(f"{may_act} {name} {words}", make, view)
-        query = {k: v for k, v in (("q", words.q), ("page", words.page), ("before", words.before)) if v}
-        live = f"/events/{name}" + (f"?{urlencode(query)}" if query else "")
-        shown: dict[str, Any] = {
-            "view": view,
-            "live": live,
-            "cursor": feed.cursor,
-            "words": words,
-            "title": title,
-        }
-        return self._page(request, template, here=name, **shown, **more)
+        live = f"/events/{name}{words.link()}".removesuffix("?")
+        shown: dict[str, Any] = {"view": view, "live": live, "cursor": feed.cursor, "words": words}
+        return self._page(request, template, here=name, title=title, **shown, **more)
 
     async def home(self, request: Request) -> Response:
         await self.refresh()
@@ -220,8 +215,7 @@ class Site:
 
     async def cluster_page(self, request: Request) -> Response:
         await self.refresh()
-        status = None if self.cluster is None else self.cluster.status
-        title = "Cluster" if status is None else f"Cluster {status.cluster}"
+        title = "Cluster" if self.status is None else f"Cluster {self.status.cluster}"
         return await self.live_page(request, "cluster", "cluster.html.j2", title)
 
     async def run_page(self, request: Request) -> Response:
@@ -291,11 +285,8 @@ class Site:
         if role is None:
             return self._page(request, "login.html.j2", 401, title="Sign in", wrong=True)
         answer = RedirectResponse("/", 303)
-        secure = request.url.scheme == "https"
-        cookie = self.access.cookie_of(role)
-        answer.set_cookie(
-            self.access.cookie, cookie, httponly=True, samesite="strict", secure=secure, path="/"
-        )
+        cookie, secure = self.access.cookie_of(role), request.url.scheme == "https"
+        answer.set_cookie(self.access.cookie, cookie, httponly=True, samesite="strict", secure=secure)
         return answer
 
     async def static(self, request: Request) -> Response:
@@ -348,7 +339,7 @@ class Site:
             await acting.logged(book, work, act=f"{kind} {verb}", name=label, by=who, **form)
         except (EvopolicyError, OSError) as error:
             raise PageError(409, "Not done", str(error)) from error
-        self._looked_at = float("-inf")
+        self._scanned_at = float("-inf")
         if self.cluster is not None:
             self.cluster.acted()
         return RedirectResponse(back, 303)
@@ -433,13 +424,13 @@ def _episode(run: RunFacts, index: int, episode: int) -> dict[str, Any]:
     detail = Detail(run.path)
     place, names = detail.episode_files(index, episode)
     beside = detail.episodes(index)
-    texts = [(name, detail.text(f"{place}/{name}")) for name in ("error.txt", "stdout.txt", "stderr.txt")]
+    texts = {name: detail.text(f"{place}/{name}") for name in ("error.txt", "stdout.txt", "stderr.txt")}
     links = {name: _file_link(run, f"{place}/{name}") for name in names}
     return {
         **episode_values(detail, place),
         "previous": episode - 1 if episode - 1 in beside else None,
         "next": episode + 1 if episode + 1 in beside else None,
-        "texts": [(name, text) for name, text in texts if text],
+        "texts": [(name, text) for name, text in texts.items() if text],
         "images": [(name, link) for name, link in links.items() if Path(name).suffix.lower() in IMAGES],
         "videos": [link for name, link in links.items() if name.endswith(".mp4")],
     }
@@ -460,8 +451,7 @@ def _file(request: Request, files: Confined, path: str, types: Mapping[str, str]
         if first > last:
             os.close(fd)
             return Response(status_code=416, headers={"content-range": f"bytes */{size}"})
-        status = 206
-        headers["content-range"] = f"bytes {first}-{last}/{size}"
+        status, headers["content-range"] = 206, f"bytes {first}-{last}/{size}"
     headers["content-length"] = str(last - first + 1)
     kind = types.get(Path(path).suffix.lower(), "text/plain; charset=utf-8")
     return StreamingResponse(_chunks(fd, first, last), status, headers, media_type=kind)
@@ -470,12 +460,7 @@ def _file(request: Request, files: Confined, path: str, types: Mapping[str, str]
 async def _chunks(fd: int, first: int, last: int) -> AsyncIterator[bytes]:
     with os.fdopen(fd, "rb") as file:
         file.seek(first)
-        remaining = last - first + 1
-        while remaining > 0:
-            data = await asyncio.to_thread(file.read, min(_CHUNK, remaining))
-            if not data:
-                return
-            remaining -= len(data)
+        while data := await asyncio.to_thread(file.read, min(_CHUNK, last + 1 - file.tell())):
             yield data
 
 
@@ -484,10 +469,10 @@ def listen(host: str, port: int) -> socket.socket:
     try:
         return bound(host, port)
     except OSError as error:
-        why = error.strerror or error
-        raise ConfigError(
-            f"cannot listen on {host}:{port}: {why}; choose another with --http HOST:PORT"
-        ) from error
+        text = (
+            f"cannot listen on {host}:{port}: {error.strerror or error}; choose another with --http HOST:PORT"
+        )
+        raise ConfigError(text) from error
 
 
 async def serve(site: Site, sock: socket.socket, ready: Callable[[], None], **tls: Path | None) -> None:

@@ -23,7 +23,7 @@ from evopolicy_common.wire import credentials, keys, transport
 from evopolicy_common.wire.credentials import Role
 from evopolicy_common.wire.transport import Link
 from evopolicy_coordinator.cli.main import app
-from evopolicy_coordinator.cli.router_config import write_router_config
+from evopolicy_coordinator.cli.router_config import router_config
 from evopolicy_coordinator.pki.machines import Machines
 
 
@@ -44,8 +44,8 @@ class Site:
         self.configure("worker/here", "gateway/desk", "operator/desk")
 
     def configure(self, *admit: str) -> None:
-        places = {"listen": (self.endpoint,), "connect": (self.certs.endpoint,)}
-        write_router_config(self.certs.state, "site", self.folder, **places, admit=admit)
+        state, places = self.certs.state, {"listen": [self.endpoint], "connect": [self.certs.endpoint]}
+        router_config("site", self.folder, state, **places, admit=list(admit))
 
     @contextlib.asynccontextmanager
     async def up(self, alive: list[tuple[str, bool]] | None = None) -> AsyncIterator[list[str]]:
@@ -133,8 +133,8 @@ async def test_a_workers_liveliness_is_seen_through_the_router_and_no_one_elses(
 async def test_a_router_behind_another_one_passes_on_as_far_as_roles_allow(site: Site) -> None:
     far = site.certs.issue("router", "far")
     endpoint = f"tls/127.0.0.1:{free_port()}"
-    rules = {"uplink": "router/site", "admit": ("worker/elsewhere",)}
-    write_router_config(site.certs.state, "far", far, listen=(endpoint,), connect=(site.endpoint,), **rules)
+    places = {"listen": [endpoint], "connect": [site.endpoint]}
+    router_config("far", far, site.certs.state, **places, uplink="router/site", admit=["worker/elsewhere"])
     site.configure("router/far", "worker/here")
     alive: list[tuple[str, bool]] = []
     found = credentials.find("worker", (endpoint,), site.elsewhere)
@@ -205,4 +205,4 @@ def test_the_command_writes_paths_of_the_routers_host(site: Site) -> None:
 def test_a_revoked_router_gets_no_file(site: Site) -> None:
     site.certs.revoke("router/site")
     with pytest.raises(ConfigError, match="not admitted"):
-        write_router_config(site.certs.state, "site", site.folder, listen=(), connect=())
+        router_config("site", site.folder, site.certs.state)

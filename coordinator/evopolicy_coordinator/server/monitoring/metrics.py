@@ -24,6 +24,7 @@ from starlette.routing import Route
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.messages.status import StatusReply
 from evopolicy_common.messages.worker import Leases
+from evopolicy_common.wire.credentials import host_and_port
 from evopolicy_common.wire.http import bound, serving
 from evopolicy_coordinator.core.contract.effects import Effect, Log, Persist, Reply
 from evopolicy_coordinator.core.contract.records import OutcomeRow, SubmitRow
@@ -192,10 +193,7 @@ async def metrics_server(address: str, meter: Meter, healthy: Callable[[], bool]
 
     Raises ConfigError for an invalid address, or one that cannot be listened on.
     """
-    host, colon, port = address.rpartition(":")
-    host = host.removeprefix("[").removesuffix("]")
-    if not colon or not host or not port.isdecimal() or int(port) >= 1 << 16:
-        raise ConfigError(f"--metrics {address!r}: use the form HOST:PORT, such as 127.0.0.1:9464")
+    host, port = host_and_port("--metrics", address, "127.0.0.1:9464")
 
     async def metrics(_: Request) -> Response:
         return Response(meter.text(), media_type=CONTENT_TYPE)
@@ -205,7 +203,7 @@ async def metrics_server(address: str, meter: Meter, healthy: Callable[[], bool]
 
     app = Starlette(routes=[Route("/metrics", metrics), Route("/healthz", health)])
     try:
-        sock = bound(host, int(port))
+        sock = bound(host, port)
     except OSError as error:
         raise ConfigError(
             f"--metrics {address}: {error.strerror or error}; choose another address"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from html import escape
+from typing import NamedTuple
 
 from evopolicy_results.studies.palette import COLOURS, REFERENCE
 
@@ -14,17 +15,14 @@ _MAX_POINTS = 600
 """Of one line: more than that a screen cannot show."""
 
 
-class Line:
+class Line(NamedTuple):
     """One line: points in order of x; a point whose y is no finite number makes a gap."""
 
-    def __init__(
-        self, name: str, points: Sequence[tuple[float, float]], *, dots: bool = False, steps: bool = False
-    ):
-        self.name = name
-        self.points = _thinned([(x, y) for x, y in points if math.isfinite(x)])
-        self.dots = dots
-        self.steps = steps
-        """Whether a value holds until the next one."""
+    name: str
+    points: Sequence[tuple[float, float]]
+    dots: bool = False
+    steps: bool = False
+    """Whether a value holds until the next one."""
 
 
 def chart(
@@ -37,6 +35,7 @@ def chart(
     reference: tuple[str, float] | None = None,
 ) -> str:
     """A chart; empty where no line has a point. `reference`: name and value of a dashed level line."""
+    lines = [line._replace(points=_thinned(line.points)) for line in lines]
     values = [y for line in lines for _, y in line.points if math.isfinite(y)]
     xs = [x for line in lines for x, y in line.points if math.isfinite(y)]
     if not values:
@@ -99,36 +98,30 @@ def chart(
 
 
 def _legend(lines: Sequence[Line], reference: tuple[str, float] | None) -> str:
-    items = [
-        '<li><svg class="mark" viewBox="0 0 16 16" aria-hidden="true"><path d="M1 8h14" stroke-width="3" '
-        f'stroke="{COLOURS[place % len(COLOURS)]}"/></svg>{escape(line.name)}</li>'
-        for place, line in enumerate(lines)
-    ]
+    strokes = [(line.name, f'"{COLOURS[place % len(COLOURS)]}"') for place, line in enumerate(lines)]
     if reference is not None:
-        items.append(
-            '<li><svg class="mark" viewBox="0 0 16 16" aria-hidden="true"><path d="M1 8h14" stroke-width="3" '
-            f'stroke="{REFERENCE}" stroke-dasharray="4 2"/></svg>{escape(reference[0])}</li>'
-        )
+        strokes.append((reference[0], f'"{REFERENCE}" stroke-dasharray="4 2"'))
+    items = (
+        '<li><svg class="mark" viewBox="0 0 16 16" aria-hidden="true"><path d="M1 8h14" stroke-width="3" '
+        f"stroke={stroke}/></svg>{escape(name)}</li>"
+        for name, stroke in strokes
+    )
     return f'<ul class="legend">{"".join(items)}</ul>'
 
 
 def _path(line: Line, x: Callable[[float], float], y: Callable[[float], float]) -> str:
-    out: list[str] = []
-    pen = False
+    out, pen = "", False
     for px, py in line.points:
-        if not math.isfinite(py):
-            pen = False
-            continue
-        if pen and line.steps:
-            out.append(f"H{x(px):.1f}V{y(py):.1f}")
-        else:
-            out.append(f"{'L' if pen else 'M'}{x(px):.1f} {y(py):.1f}")
-        pen = True
-    return "".join(out)
+        if math.isfinite(py):
+            move, then = ("H", "V") if pen and line.steps else ("L" if pen else "M", " ")
+            out += f"{move}{x(px):.1f}{then}{y(py):.1f}"
+        pen = math.isfinite(py)
+    return out
 
 
-def _thinned(points: list[tuple[float, float]]) -> list[tuple[float, float]]:
-    """At most `_MAX_POINTS`: of each stretch its least and its greatest value, in order."""
+def _thinned(points: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
+    """Those of finite x, at most `_MAX_POINTS`: of each stretch its least and its greatest value, in order."""
+    points = [(x, y) for x, y in points if math.isfinite(x)]
     if len(points) <= _MAX_POINTS:
         return points
     size = math.ceil(2 * len(points) / _MAX_POINTS)

@@ -34,14 +34,13 @@ class Name(NamedTuple):
 
 
 class Confined:
-    """Files below `root`, which is trusted itself. Paths are relative, with `/`. Raises NotThereError for every
-    refused path."""
+    """Files below `root`, which is trusted itself. Paths are relative, with `/`."""
 
     def __init__(self, root: Path) -> None:
         self.root = root
 
     def open(self, path: str) -> int:
-        """A descriptor of a regular file, which the caller closes."""
+        """A descriptor of a regular file, which the caller closes. Raises NotThereError for a refused path."""
         *folders, name = _parts(path)
         folder = self._folder(folders)
         try:
@@ -53,21 +52,17 @@ class Confined:
             os.close(folder)
 
     def read(self, path: str, limit: int) -> bytes:
-        """At most `limit` bytes of a regular file."""
-        with os.fdopen(self.open(path), "rb") as file:
-            return file.read(limit)
-
-    def found(self, path: str, limit: int) -> bytes:
-        """As `read`; empty for a refused path."""
+        """At most `limit` bytes of a regular file; empty for a refused path."""
         try:
-            return self.read(path, limit)
+            with os.fdopen(self.open(path), "rb") as file:
+                return file.read(limit)
         except NotThereError:
             return b""
 
     def names(self, path: str) -> list[Name]:
         """Regular files and folders of a folder, by name, the first few thousand; links and all else are left
         out. Empty for a refused path."""
-        found: list[Name] = []
+        names: list[Name] = []
         with contextlib.suppress(NotThereError, OSError):
             folder = self._folder(_parts(path))
             try:
@@ -75,13 +70,12 @@ class Confined:
                     for entry in itertools.islice(entries, _MAX_NAMES):
                         with contextlib.suppress(OSError):
                             info = entry.stat(follow_symlinks=False)
-                            if stat.S_ISDIR(info.st_mode):
-                                found.append(Name(entry.name, True, 0))
-                            elif stat.S_ISREG(info.st_mode):
-                                found.append(Name(entry.name, False, info.st_size))
+                            is_folder = stat.S_ISDIR(info.st_mode)
+                            if is_folder or stat.S_ISREG(info.st_mode):
+                                names.append(Name(entry.name, is_folder, 0 if is_folder else info.st_size))
             finally:
                 os.close(folder)
-        return sorted(found)
+        return sorted(names)
 
     def _folder(self, parts: list[str]) -> int:
         try:

@@ -10,13 +10,11 @@ from __future__ import annotations
 import asyncio
 import secrets
 from collections.abc import AsyncIterator, Callable
-from typing import Any, TypeVar
+from typing import Any
 
 import msgspec
 
 from evopolicy_coordinator.web.content.rendering import View
-
-T = TypeVar("T")
 
 LEAST_PAUSE_S = 0.5
 """Between two updates of one browser."""
@@ -34,8 +32,8 @@ class Feed:
         """Versions of another feed, before a restart, mean nothing here."""
         self.version = 0
         self.watchers = 0
-        self._parts: dict[str, tuple[int, str]] = {}
-        self._lists: dict[str, tuple[int, tuple[str, ...]]] = {}
+        self._content: dict[tuple[str, str], tuple[int, Any]] = {}
+        """By `parts` or `lists`, and the element's id: the version of its last change, and its content."""
         self._changed = asyncio.Event()
 
     @property
@@ -45,15 +43,15 @@ class Feed:
 
     def update(self, view: View) -> None:
         """Takes what has changed."""
-        version = self.version + 1
-        parts = {name: _newer(self._parts.get(name), html, version) for name, html in view.parts.items()}
-        lists = {
-            name: _newer(self._lists.get(name), tuple(order), version) for name, order in view.lists.items()
+        now: dict[tuple[str, str], Any] = {("parts", name): html for name, html in view.parts.items()}
+        now |= {("lists", name): tuple(order) for name, order in view.lists.items()}
+        known = self._content
+        changed = {
+            key: (self.version + 1, now[key]) for key in now if known.get(key, (0, None))[1] != now[key]
         }
-        changed = any(each[0] == version for each in (*parts.values(), *lists.values()))
-        self._parts, self._lists = parts, lists
+        self._content = {key: changed.get(key) or known[key] for key in now}
         if changed:
-            self.version = version
+            self.version += 1
             event, self._changed = self._changed, asyncio.Event()
             event.set()
 
@@ -63,10 +61,11 @@ class Feed:
         known = int(number) if epoch == self.epoch and number.isdecimal() and len(number) < 16 else -1
         if known >= self.version:
             return None
-        return {
-            "parts": {name: html for name, (version, html) in self._parts.items() if version > known},
-            "lists": {name: order for name, (version, order) in self._lists.items() if version > known},
-        }
+        changes: dict[str, Any] = {"parts": {}, "lists": {}}
+        for (kind, name), (version, content) in self._content.items():
+            if version > known:
+                changes[kind][name] = content
+        return changes
 
     async def events(self, cursor: str) -> AsyncIterator[bytes]:
         """Server-sent events from a cursor on, until the client closes the stream."""
@@ -75,8 +74,8 @@ class Feed:
             yield b"retry: 2000\n\n"
             while True:
                 changed = self._changed
-                found = self.since(cursor)
-                if found is None:
+                changes = self.since(cursor)
+                if changes is None:
                     try:
                         async with asyncio.timeout(KEEP_ALIVE_S):
                             await changed.wait()
@@ -84,14 +83,10 @@ class Feed:
                         yield b": still here\n\n"
                     continue
                 cursor = self.cursor
-                yield b"id: %s\nevent: update\ndata: %s\n\n" % (cursor.encode(), msgspec.json.encode(found))
+                yield b"id: %s\nevent: update\ndata: %s\n\n" % (cursor.encode(), msgspec.json.encode(changes))
                 await asyncio.sleep(LEAST_PAUSE_S)
         finally:
             self.watchers -= 1
-
-
-def _newer(known: tuple[int, T] | None, content: T, version: int) -> tuple[int, T]:
-    return known if known is not None and known[1] == content else (version, content)
 
 
 class Feeds:
@@ -102,8 +97,7 @@ class Feeds:
 
     def of(self, name: str, view: Callable[[], View], current: View | None = None) -> Feed:
         """The feed of a page; `view` makes its content, `current` is what it is now where that is known."""
-        found = self._feeds.pop(name, None)
-        feed = Feed() if found is None else found[0]
+        feed = self._feeds.pop(name)[0] if name in self._feeds else Feed()
         self._feeds[name] = feed, view
         if current is not None:
             feed.update(current)

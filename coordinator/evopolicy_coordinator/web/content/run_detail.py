@@ -10,7 +10,7 @@ import contextlib
 import itertools
 import os
 from collections import OrderedDict
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from string import Formatter
 from typing import Any
@@ -97,12 +97,12 @@ class Detail:
     def code(self, index: int, *, checkpoints: bool) -> tuple[CodeFile, ...]:
         """`system/` as it was at a submit; empty where it is not told. `checkpoints`: the run's own may be read."""
         digest = self._bundle_of(index)
-        found = None if digest is None else _unpacked(self.files, digest)
-        if found is not None or not checkpoints:
-            return found or ()
+        files = None if digest is None else _unpacked(self.files, digest)
+        if files is not None or not checkpoints:
+            return files or ()
         folder = self._numbered("checkpoints/submit_", index)
         return _ordered(
-            CodeFile(path=path, size=size, text=_as_text(self.files.found(f"{folder}/{path}", MAX_TEXT + 1)))
+            CodeFile(path=path, size=size, text=_as_text(self.files.read(f"{folder}/{path}", MAX_TEXT + 1)))
             for path, size in self._below(folder)
             if path not in METADATA
         )
@@ -110,7 +110,7 @@ class Detail:
     def _bundle_of(self, index: int) -> str | None:
         """The digest of a submit's snapshot, by the gateway's journal."""
         bundles_by_key: dict[str, str | None] = {}
-        for line in self.files.found(open_run.JOURNAL, _MAX_JOURNAL).splitlines():
+        for line in self.files.read(open_run.JOURNAL, _MAX_JOURNAL).splitlines():
             try:
                 entry = open_run.entry_decoder.decode(line)
             except DECODE_ERRORS:
@@ -147,7 +147,7 @@ class Detail:
 
     def summary(self, index: int) -> Mapping[str, Any]:
         """A submit's summary, as its agent has it; empty where there is none."""
-        data = self.files.found(f"{self.folder_of(index)}/summary.json", _MAX_TRAJECTORY)
+        data = self.files.read(f"{self.folder_of(index)}/summary.json", _MAX_TRAJECTORY)
         return next(objects([data]), {})
 
     def episodes(self, index: int) -> list[int]:
@@ -165,16 +165,12 @@ class Detail:
 
     def text(self, path: str) -> str:
         """The beginning of a file as text; empty where there is none."""
-        return self.files.found(path, MAX_TEXT).decode("utf-8", "replace")
+        return self.files.read(path, MAX_TEXT).decode("utf-8", "replace")
 
     def played(self, folder: str) -> tuple[int, dict[str, list[Line]], str]:
         """Number of steps of an episode, its columns by title of a plot, and a note; what can be drawn."""
-        rows = list(
-            itertools.islice(
-                objects(self.files.found(f"{folder}/trajectory.jsonl", _MAX_TRAJECTORY).splitlines()),
-                MAX_STEPS,
-            )
-        )
+        lines = self.files.read(f"{folder}/trajectory.jsonl", _MAX_TRAJECTORY).splitlines()
+        rows = list(itertools.islice(objects(lines), MAX_STEPS))
         inline = [row.get("obs") for row in rows]
         observed: Any = inline if any(each is not None for each in inline) else self._arrays(folder)
         observations, note = _series(observed, len(rows), "obs")
@@ -185,30 +181,26 @@ class Detail:
     def _arrays(self, folder: str) -> Any:
         for name in ("observations.npy", "observations.npz"):
             with contextlib.suppress(OSError, ValueError):
-                data = self.files.found(f"{folder}/{name}", _MAX_TRAJECTORY)
-                found = read_arrays(data, _MAX_UNPACKED)
-                return found.get("", found)
+                arrays = read_arrays(self.files.read(f"{folder}/{name}", _MAX_TRAJECTORY), _MAX_UNPACKED)
+                return arrays.get("", arrays)
         return None
 
     def replays(self) -> list[str]:
         """Names of the recorded hidden episodes. They are hidden results: only for whom those may be shown."""
         names = [name.name for name in self.files.names("replays") if name.is_folder]
-        return [name for name in names if self.files.found(f"replays/{name}/video.mp4", 1)]
+        return [name for name in names if self.files.read(f"replays/{name}/video.mp4", 1)]
 
     # ---- words and events ----
 
     def messages(self, before: int | None = None) -> list[Message]:
         """The last entries of the agent's log, or the last that begin before a place in it; oldest first."""
-        found: list[Message] = []
-        for at, line in self._last_lines("logs/agent.jsonl", before):
-            found += _messages(at, line)
-        return found[-MAX_WORDS:]
+        lines = self._last_lines("logs/agent.jsonl", before)
+        return [each for at, line in lines for each in _messages(at, line)][-MAX_WORDS:]
 
     def happened(self) -> list[Happened]:
         """The last events of the run; newest first."""
         lines = [line for _, line in self._last_lines("logs/harness.log", None)]
-        found = list(map(_event, objects(lines)))
-        return found[-MAX_WORDS:][::-1]
+        return list(map(_event, objects(lines)))[-MAX_WORDS:][::-1]
 
     def _last_lines(self, path: str, before: int | None) -> list[tuple[int, bytes]]:
         """Whole lines near the end of a file, or before a place in it, with their places."""
@@ -221,14 +213,9 @@ class Detail:
             start = max(0, end - _TAIL)
             file.seek(start)
             data = file.read(end - start)
-        whole = data.rfind(b"\n") + 1
-        found: list[tuple[int, bytes]] = []
-        place = 0
-        for line in data[:whole].splitlines(keepends=True):
-            if place or start == 0:
-                found.append((start + place, line))
-            place += len(line)
-        return found
+        lines = data[: data.rfind(b"\n") + 1].splitlines(keepends=True)
+        places = itertools.accumulate(map(len, lines), initial=start)
+        return list(zip(places, lines, strict=False))[1 if start else 0 :]
 
 
 _unpacked_bundles: OrderedDict[str, tuple[CodeFile, ...]] = OrderedDict()
@@ -239,18 +226,16 @@ def _unpacked(files: Confined, digest: str) -> tuple[CodeFile, ...] | None:
     if digest in _unpacked_bundles:
         return _unpacked_bundles[digest]
     try:
-        packed = files.read(f"{open_run.BUNDLES}/{digest[:2]}/{digest}", _MAX_BUNDLE)
-        bundle = bundles.load(packed, digest)
-    except (NotThereError, BundleError, *DECODE_ERRORS):
+        bundle = bundles.load(files.read(f"{open_run.BUNDLES}/{digest[:2]}/{digest}", _MAX_BUNDLE), digest)
+    except (BundleError, *DECODE_ERRORS):
         return None
-    found = _ordered(
+    unpacked = _unpacked_bundles[digest] = _ordered(
         CodeFile(path=file.path, size=len(file.data), text=_as_text(file.data))
         for file in bundle.files[:_MAX_FILES]
     )
-    _unpacked_bundles[digest] = found
     if len(_unpacked_bundles) > 16:
         _unpacked_bundles.popitem(last=False)
-    return found
+    return unpacked
 
 
 def _ordered(files: Iterable[CodeFile]) -> tuple[CodeFile, ...]:
@@ -280,8 +265,8 @@ def _series(columns: Any, n: int, name: str) -> tuple[list[Line], str]:
         columns = {key: [row.get(key) for row in rows] for key in columns[0]}
     if isinstance(columns, dict):
         parts = [_series(value, n, key) for key, value in sorted(columns.items())]
-        found = [each for one, _ in parts for each in one]
-        return found[:_MAX_SERIES], next((note for _, note in parts if note), "")
+        lines = [each for one, _ in parts for each in one]
+        return lines[:_MAX_SERIES], next((note for _, note in parts if note), "")
     try:
         array = np.asarray(columns, dtype=np.float64)
     except (TypeError, ValueError, OverflowError):
@@ -292,10 +277,9 @@ def _series(columns: Any, n: int, name: str) -> tuple[list[Line], str]:
     width = array.shape[1]
     if width > 64:
         return [], f"{name} has {width:,} numbers a step, so it is not drawn."
-    columns = array[:, :_MAX_SERIES].T.tolist()
     lines = [
         Line(name if width == 1 else f"{name}[{i}]", list(enumerate(values)))
-        for i, values in enumerate(columns)
+        for i, values in enumerate(array[:, :_MAX_SERIES].T.tolist())
     ]
     return lines, f"The first {_MAX_SERIES} of {width} components are drawn." if width > _MAX_SERIES else ""
 
@@ -303,58 +287,60 @@ def _series(columns: Any, n: int, name: str) -> tuple[list[Line], str]:
 # ---- the agent's log ----
 
 
+_FORMS: Mapping[str, Sequence[tuple[str, str, str]]] = {
+    "prompt": [("prompt", "Prompt", "message")],
+    "stdout": [("output", "", "text")],
+    "stderr": [("stderr", "", "text")],
+    "turn": [("message", "", "text")],
+    "result": [("ended", "Turn ended", "subtype")],
+    "log_full": [("ended", "log_full", "text message")],
+    "error": [("ended", "error", "text message")],
+    "block text": [("message", "", "text")],
+    "block thinking": [("message", "Thinking", "thinking")],
+    "block tool_use": [("tool", "{name}", "input")],
+    "block tool_result": [("result", "Result", "content")],
+    "item agent_message": [("message", "", "text")],
+    "item assistant_message": [("message", "", "text")],
+    "item reasoning": [("message", "Thinking", "text")],
+    "item command_execution": [("tool", "shell", "command"), ("result", "Result", "aggregated_output")],
+    "item mcp_tool_call": [("tool", "mcp_tool_call", "arguments changes")],
+    "item file_change": [("tool", "file_change", "arguments changes")],
+}
+"""By the type of a line, of a block of a message, or of a Codex item: kind and title of its entries, and the fields of
+which the first that is not empty is the text."""
+
+
 def _messages(at: int, line: bytes) -> Iterator[Message]:
-    for value in objects([line]):
-        for number, (kind, title, text) in enumerate(_entries(value)):
-            if text.strip() or title:
-                yield Message(at=at + number, kind=kind, title=title[:200], text=_cut(text.strip()))
+    told = (
+        entry for value in objects([line]) for form, inner in _parts(value) for entry in _told(form, inner)
+    )
+    for number, (kind, title, text) in enumerate(told):
+        if text.strip() or title:
+            yield Message(at=at + number, kind=kind, title=title[:200], text=_cut(text.strip()))
 
 
-def _entries(value: dict[str, Any]) -> Iterator[tuple[str, str, str]]:
-    """Kind, title and text of what a line tells, in the forms that harnesses write."""
+def _parts(value: dict[str, Any]) -> Iterator[tuple[str, dict[str, Any]]]:
+    """The parts of a line with text, in the forms that harnesses write, each with its form."""
     kind = value.get("type")
-    if kind == "prompt":
-        yield "prompt", "Prompt", str(value.get("message", ""))
-    elif kind in ("stdout", "stderr"):
-        yield ("output" if kind == "stdout" else "stderr"), "", str(value.get("text", ""))
-    elif kind in ("assistant", "user") and isinstance(value.get("message"), dict):
+    if kind in ("assistant", "user") and isinstance(value.get("message"), dict):
         content = value["message"].get("content")
-        for block in [{"type": "text", "text": content}] if isinstance(content, str) else content or ():
+        blocks = [{"type": "text", "text": content}] if isinstance(content, str) else content
+        for block in blocks if isinstance(blocks, list) else ():
             if isinstance(block, dict):
-                yield from _block(block)
-    elif kind == "item.completed" and isinstance(value.get("item"), dict):
-        yield from _item(value["item"])
+                yield f"block {block.get('type')}", block
+    elif kind == "item.completed" and isinstance(item := value.get("item"), dict):
+        yield f"item {item.get('type') or item.get('item_type')}", item
     elif isinstance(value.get("turn"), int) and "text" in value:
-        yield "message", "", str(value["text"])
-    elif kind == "result":
-        yield "ended", "Turn ended", str(value.get("subtype", ""))
-    elif kind in ("log_full", "error"):
-        yield "ended", str(kind), str(value.get("text") or value.get("message") or "")
+        yield "turn", value
+    else:
+        yield str(kind), value
 
 
-def _block(block: dict[str, Any]) -> Iterator[tuple[str, str, str]]:
-    kind = block.get("type")
-    if kind == "text":
-        yield "message", "", str(block.get("text", ""))
-    elif kind == "thinking":
-        yield "message", "Thinking", str(block.get("thinking", ""))
-    elif kind == "tool_use":
-        yield "tool", str(block.get("name", "tool")), _plain(block.get("input"))
-    elif kind == "tool_result":
-        yield "result", "Result", _plain(block.get("content"))
-
-
-def _item(item: dict[str, Any]) -> Iterator[tuple[str, str, str]]:
-    kind = item.get("type") or item.get("item_type")
-    if kind in ("agent_message", "assistant_message"):
-        yield "message", "", str(item.get("text", ""))
-    elif kind == "reasoning":
-        yield "message", "Thinking", str(item.get("text", ""))
-    elif kind == "command_execution":
-        yield "tool", "shell", _plain(item.get("command"))
-        yield "result", "Result", _plain(item.get("aggregated_output"))
-    elif kind in ("mcp_tool_call", "file_change"):
-        yield "tool", str(kind), _plain(item.get("arguments") or item.get("changes"))
+def _told(form: str, value: dict[str, Any]) -> Iterator[tuple[str, str, str]]:
+    """Kind, title and text of each entry."""
+    for kind, title, fields in _FORMS.get(form, ()):
+        text = next((value[name] for name in fields.split() if value.get(name)), "")
+        yield kind, title.format(name=value.get("name", "tool")), _plain(text)
 
 
 def _plain(value: Any) -> str:
@@ -394,13 +380,9 @@ def _event(entry: dict[str, Any]) -> Happened:
         for each, value in entry.items()
         if each not in _NOT_SHOWN and value not in ("", None)
     }
-    text = name
-    if name in _EVENTS:
-        used = {field for _, field, _, _ in Formatter().parse(_EVENTS[name]) if field}
-        if used <= values.keys():
-            text = _EVENTS[name].format(**{each: in_words(values.pop(each)) for each in used})
-    return Happened(
-        at=str(entry.get("timestamp", ""))[:19].replace("T", " "),
-        level=str(entry.get("level", ""))[:20],
-        text=event_text(text, values),
-    )
+    text, form = name, _EVENTS.get(name, "")
+    used = {field for _, field, _, _ in Formatter().parse(form) if field}
+    if form and used <= values.keys():
+        text = form.format(**{each: in_words(values.pop(each)) for each in used})
+    at = str(entry.get("timestamp", ""))[:19].replace("T", " ")
+    return Happened(at=at, level=str(entry.get("level", ""))[:20], text=event_text(text, values))

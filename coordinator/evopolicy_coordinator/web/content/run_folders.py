@@ -14,12 +14,12 @@ import time
 from collections.abc import Iterable, Mapping, Sequence
 from datetime import datetime
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import msgspec
 
 from evopolicy_common.errors import DECODE_ERRORS, ProtocolError
-from evopolicy_common.messages.run_settings import RunSettings, Start
+from evopolicy_common.messages.run_settings import Start
 from evopolicy_common.messages.status import RunStatus
 from evopolicy_common.records import open_run
 from evopolicy_common.records.open_run import IntendedRun, OpenedRun
@@ -31,7 +31,10 @@ from evopolicy_coordinator.web.content.confined import Confined
 from evopolicy_results.reading.environments import learn_names
 from evopolicy_results.reading.reader import find_run_dirs
 
+T = TypeVar("T")
+
 _MAX_SUMMARY_BYTES = 8 << 20
+_TOKENS = ("input_noncached", "cache_read", "cache_creation", "output")
 _FROM_SETTINGS = ("entry", "env", "exp_id", "repeat", "budget", "hidden_cases", "start", "replay_of")
 _BY_EPISODE = ("env_instances", "returns", "episode_lengths", "reward_components_per_episode", "successes")
 
@@ -107,7 +110,7 @@ class RunFacts(msgspec.Struct, frozen=True, kw_only=True):
         return self.replay_of or ("" if self.start is None else self.start.run)
 
     @property
-    def left_s(self) -> float | None:
+    def remaining_s(self) -> float | None:
         """Seconds until the budget is spent, at the present rate."""
         if self.finished or self.started_at is None or not self.budget or not self.used:
             return None
@@ -125,7 +128,7 @@ class Sweep(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Runs(msgspec.Struct, frozen=True, kw_only=True):
-    """All that was found at one time."""
+    """All runs at one time."""
 
     sweeps: tuple[Sweep, ...] = ()
     by_key: Mapping[str, RunFacts] = {}
@@ -159,7 +162,6 @@ class Reader:
         self.roots = tuple(root.resolve() for root in roots)
         self._records: dict[Path, tuple[tuple[int, int], RunFacts]] = {}
         self._submits: dict[Path, dict[str, Summary]] = {}
-        self._known: frozenset[Path] = frozenset()
 
     def read(self, cluster: Sequence[RunStatus] | None, *, cluster_is_known: bool) -> Runs:
         """All runs as they are now. `cluster`: its unfinished runs; `cluster_is_known` False: it should be asked and
@@ -177,18 +179,19 @@ class Reader:
             entries = [] if index is None else list(index.runs.values())
             by_folder = {root / each.directory: each for each in entries if each.directory}
             here = set(folders)
-            found = [self.run(folder, by_folder.get(folder), by_run) for folder in folders]
+            runs = [self.run(folder, by_folder.get(folder), by_run) for folder in folders]
+            suite = root.name if index is None else index.suite
             for entry in entries:
                 if not entry.directory or root / entry.directory not in here:
                     # Another host of the sweep may have started it and reported its id only to the coordinator.
-                    name = "" if index is None else f"{index.suite}-{entry.repeat}"
-                    status = by_run.get(entry.run) or by_name.get((entry.agent, entry.env, name))
-                    found.append(_without_folder(root, entry, status))
-            name = root.name if index is None else index.suite
+                    name = (entry.agent, entry.env, f"{suite}-{entry.repeat}")
+                    status = by_run.get(entry.run) or by_name.get(name)
+                    runs.append(_elsewhere(f"{root}\n{entry.name}", entry, status))
             paused, is_suite = (root / PAUSED).exists(), index is not None
-            sweeps.append(Sweep(name=name, root=root, runs=tuple(found), is_suite=is_suite, paused=paused))
+            sweeps.append(Sweep(name=suite, root=root, runs=tuple(runs), is_suite=is_suite, paused=paused))
         seen = {run.run for sweep in sweeps for run in sweep.runs}
-        if elsewhere := tuple(_of_cluster(status) for name, status in by_run.items() if name not in seen):
+        others = [each for each in by_run.values() if each.run not in seen]
+        if elsewhere := tuple(_elsewhere(each.run, None, each) for each in others):
             sweeps.append(Sweep(name="elsewhere on the cluster", root=None, runs=elsewhere, is_suite=False))
         by_key = {run.key: run for sweep in sweeps for run in sweep.runs}
         open_here = [run for run in by_key.values() if run.path and run.agent_alive and not run.finished]
@@ -222,7 +225,7 @@ class Reader:
             index = name.name.removeprefix("submit_")
             if name.name in known or index == name.name or not index.isdecimal():
                 continue
-            data = confined.found(f"workspace/feedback/{name.name}/summary.json", _MAX_SUMMARY_BYTES)
+            data = confined.read(f"workspace/feedback/{name.name}/summary.json", _MAX_SUMMARY_BYTES)
             with contextlib.suppress(ProtocolError):
                 known[name.name] = msgspec.structs.replace(decode_summary(data), **dict.fromkeys(_BY_EPISODE))
         summaries = sorted(known.values(), key=lambda each: each.submit_index)
@@ -230,17 +233,19 @@ class Reader:
         return list(map(Submit, summaries, consumed))
 
     def _open(self, folder: Path, entry: Entry | None, by_run: Mapping[str, RunStatus]) -> RunFacts:
-        settings, run = _settings(folder), _opened(folder)
+        intended = _decoded(folder, open_run.INTENDED, IntendedRun)
+        opened = _decoded(folder, open_run.OPENED, OpenedRun)
+        run = "" if opened is None else opened.run
         status, submits = by_run.get(run), self.submits(folder)
         alive = _agent_alive(folder) if status is None else _may_be_alive(status)
         facts: dict[str, Any] = {**_placed(folder), "run": run, "agent_alive": alive, "budget": None}
         facts["state"] = "open" if alive else "interrupted"
         if entry is not None:
-            facts |= {"entry": entry.agent, "env": entry.env, "repeat": entry.repeat, **_of_entry(entry)}
+            facts |= _of_entry(entry)
             if entry.state != "pending":
                 facts["state"] = "open" if entry.state == "running" else entry.state
-        if settings is not None:
-            facts |= {name: getattr(settings, name) for name in _FROM_SETTINGS}
+        if intended is not None:
+            facts |= {name: getattr(intended.settings, name) for name in _FROM_SETTINGS}
         if submits:
             last = submits[-1]
             facts |= {"used": last.consumed, "n_submits": len(submits), "best": _best(submits)}
@@ -264,7 +269,7 @@ def _best(submits: Iterable[Submit]) -> float | None:
 
 
 def _placed(folder: Path) -> dict[str, Any]:
-    """What the place of a run's folder tells."""
+    """The facts that follow from the path of a run's folder."""
     entry, env, exp_id = folder.parts[-3:]
     env = env.replace("_", "/", 1)
     return {"key": key_of(str(folder)), "path": folder, "entry": entry, "env": env, "exp_id": exp_id}
@@ -309,58 +314,39 @@ def _finished(folder: Path) -> RunFacts:
     )
 
 
-def _without_folder(root: Path, entry: Entry, status: RunStatus | None) -> RunFacts:
-    """A run of a sweep without a folder here: it has not started, or another host plays it."""
-    facts = RunFacts(
-        key=key_of(f"{root}\n{entry.name}"),
-        path=None,
-        run=entry.run,
-        entry=entry.agent,
-        env=entry.env,
-        exp_id=entry.name,
-        repeat=entry.repeat,
-        state=entry.state,
-        used=entry.budget_used,
-        n_submits=entry.n_submits,
-        wall_s=entry.wall_s,
-        score=entry.score,
-        random=entry.random,
-        finished=entry.state not in ("pending", "running"),
-        **_of_entry(entry),
-    )
-    if status is None:
-        return facts
-    told = _of_status(status)
-    return msgspec.structs.replace(facts, **{**told, "host": entry.host or told["host"]})
-
-
-def _of_cluster(status: RunStatus) -> RunFacts:
-    """A run that only the cluster tells of: its folder is on another host."""
-    return RunFacts(
-        key=key_of(status.run),
-        path=None,
-        entry=status.entry,
-        env=status.env,
-        exp_id=status.exp_id or status.run,
-        repeat=status.repeat,
-        agent_alive=_may_be_alive(status),
-        **_of_status(status),
-    )
+def _elsewhere(key: str, entry: Entry | None, status: RunStatus | None) -> RunFacts:
+    """A run without a folder here: it has not started, or another host plays it."""
+    facts: dict[str, Any] = {"key": key_of(key), "path": None}
+    if entry is not None:
+        names = ("run", "state", "n_submits", "wall_s", "score", "random")
+        facts |= {**_of_entry(entry), **{name: getattr(entry, name) for name in names}}
+        facts |= {"exp_id": entry.name, "used": entry.budget_used}
+        facts["finished"] = entry.state not in ("pending", "running")
+    elif status is not None:
+        facts |= {name: getattr(status, name) for name in ("entry", "env", "repeat")}
+        facts["exp_id"] = status.exp_id or status.run
+    if status is not None:
+        facts |= {**_of_status(status), "host": facts.get("host") or status.agent_host}
+    return RunFacts(**facts)
 
 
 def _of_entry(entry: Entry) -> dict[str, Any]:
-    """The facts that only a sweep's index has."""
+    """The facts that a sweep's index has of every run of it."""
+    tokens = [each for each in (entry.tokens, entry.earlier) if each]
     return {
+        "entry": entry.agent,
+        "env": entry.env,
+        "repeat": entry.repeat,
         "attempt": entry.attempt,
-        "tokens": _n_tokens(entry.tokens) + _n_tokens(entry.earlier),
-        "cost": _cost(entry.tokens) + _cost(entry.earlier),
+        "tokens": sum(int(each.get(name) or 0) for each in tokens for name in _TOKENS),
+        "cost": sum(float(each.get("cost") or 0.0) for each in tokens),
         "error": entry.error or "",
         "host": entry.host,
     }
 
 
 def _of_status(status: RunStatus) -> dict[str, Any]:
-    """The facts that the cluster has of a run without a folder here."""
+    """The facts of an unfinished run that the cluster has."""
     return {
         "run": status.run,
         "state": status.phase,
@@ -372,7 +358,6 @@ def _of_status(status: RunStatus) -> dict[str, Any]:
         "running": status.running,
         "queued": status.queued,
         "started_at": status.created_at or None,
-        "host": status.agent_host,
     }
 
 
@@ -383,17 +368,17 @@ def _may_be_alive(status: RunStatus) -> bool:
 def _sweep_folders(roots: Iterable[Path]) -> list[tuple[Path, Index | None]]:
     """The sweeps at and directly below the roots, with their indexes. A root that is no sweep has the index None:
     single runs may lie in it."""
-    found: dict[Path, Index | None] = {}
+    sweeps: dict[Path, Index | None] = {}
     for root in roots:
         if (root / INDEX).exists():
-            found[root] = _index(root)
+            sweeps[root] = _index(root)
             continue
         with contextlib.suppress(OSError):
             for child in sorted(root.iterdir()):
                 if (child / INDEX).exists():
-                    found[child] = _index(child)
-        found[root] = None
-    return list(found.items())
+                    sweeps[child] = _index(child)
+        sweeps[root] = None
+    return list(sweeps.items())
 
 
 def _index(root: Path) -> Index | None:
@@ -403,18 +388,11 @@ def _index(root: Path) -> Index | None:
         return None
 
 
-def _settings(folder: Path) -> RunSettings | None:
-    data = Confined(folder).found(open_run.INTENDED, _MAX_SUMMARY_BYTES)
+def _decoded(folder: Path, name: str, kind: type[T]) -> T | None:
+    """The content of a file of an open run; None where it is missing or damaged."""
     with contextlib.suppress(*DECODE_ERRORS):
-        return msgspec.json.decode(data, type=IntendedRun).settings
+        return msgspec.json.decode(Confined(folder).read(name, _MAX_SUMMARY_BYTES), type=kind)
     return None
-
-
-def _opened(folder: Path) -> str:
-    data = Confined(folder).found(open_run.OPENED, _MAX_SUMMARY_BYTES)
-    with contextlib.suppress(*DECODE_ERRORS):
-        return msgspec.json.decode(data, type=OpenedRun).run
-    return ""
 
 
 def _agent_alive(folder: Path) -> bool:
@@ -425,15 +403,6 @@ def _agent_alive(folder: Path) -> bool:
         state = (folder / open_run.STATE).iterdir()
         return any(open_run.is_held(path) for path in state if path.suffix == ".lock")
     return False
-
-
-def _n_tokens(tokens: dict[str, Any] | None) -> int:
-    names = ("input_noncached", "cache_read", "cache_creation", "output")
-    return sum(int((tokens or {}).get(name) or 0) for name in names)
-
-
-def _cost(tokens: dict[str, Any] | None) -> float:
-    return float((tokens or {}).get("cost") or 0.0)
 
 
 def _unix(text: str) -> float | None:

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, TypeVar
 from urllib.parse import urlencode
 
 import msgspec
 
 from evopolicy_coordinator.web.content.run_folders import key_of
+
+T = TypeVar("T")
 
 PAGE_ROWS = 50
 """Rows of a table on one page."""
@@ -34,12 +36,12 @@ def ident(*texts: str) -> str:
     return "x" + key_of("\n".join(texts))
 
 
-def matches(q: str, *texts: str) -> bool:
-    row = " ".join(texts).lower()
-    return all(word in row for word in q.lower().split())
-
-
-def paged(rows: Sequence[Any], words: Words) -> tuple[Sequence[Any], dict[str, Any]]:
+def paged(
+    every: Iterable[T], words: Words, texts: Callable[[T], Iterable[str]]
+) -> tuple[Sequence[T], dict[str, Any]]:
+    """The rows of the page that `words` select, and the page's place. `texts`: of a row, for the search."""
+    wanted = words.q.lower().split()
+    rows = [row for row in every if all(word in " ".join(texts(row)).lower() for word in wanted)]
     last = max(0, (len(rows) - 1) // PAGE_ROWS)
     at = min(max(0, words.page), last)
     view = {

@@ -19,7 +19,7 @@ from evopolicy_coordinator.web.content.cluster import Cluster
 from evopolicy_coordinator.web.content.remarks import audits, remarks
 from evopolicy_coordinator.web.content.rendering import View, part, short
 from evopolicy_coordinator.web.content.run_folders import RunFacts, Runs
-from evopolicy_coordinator.web.content.tables import PAGE_ROWS, Words, ident, matches, paged
+from evopolicy_coordinator.web.content.tables import PAGE_ROWS, Words, ident, paged
 from evopolicy_results.html import notice
 from evopolicy_results.reading.environments import title_of
 
@@ -40,12 +40,8 @@ def cluster_view(cluster: Cluster, words: Words, runs: Runs, roots: Sequence[Pat
     classes = {worker.fingerprint: worker.versions for worker in status.workers}
     by_run = {run.run: run for run in runs.by_key.values() if run.run}
     names = {run.run: f"{run.entry} on {title_of(run.env)}" for run in status.runs}
-    kept = [
-        one
-        for one in sorted(status.workers, key=lambda one: (one.state == "active", one.worker))
-        if matches(words.q, one.worker, one.host, one.state, one.fingerprint, *one.environments)
-    ]
-    shown, pages = paged(kept, words)
+    workers = sorted(status.workers, key=lambda one: (one.state == "active", one.worker))
+    shown, pages = paged(workers, words, _row_texts)
     svg = Markup(_history(cluster))
     view.parts |= {
         "facts": part("facts", facts=_cluster_facts(status) if cluster.status else []),
@@ -66,6 +62,10 @@ def cluster_view(cluster: Cluster, words: Words, runs: Runs, roots: Sequence[Pat
         key = by_run[run.run].key if run.run in by_run else ""
         view.row("open-rows", "open_row", ident("open", run.run), run=run, key=key)
     return view
+
+
+def _row_texts(one: WorkerStatus) -> tuple[str, ...]:
+    return one.worker, one.host, one.state, one.fingerprint, *one.environments
 
 
 def _cluster_facts(status: StatusReply) -> list[tuple[str, str]]:
@@ -90,19 +90,19 @@ def _cluster_notices(cluster: Cluster, status: StatusReply) -> list[dict[str, An
     why = cluster.trouble or ("" if cluster.status else "It has not answered yet.")
     notices: list[dict[str, Any]] = []
     for title, lines in {silent: [why], **remarks(status)}.items():
-        if found := [line for line in lines if line]:
-            more = [f"… and {len(found) - _NOTICE_LINES} more"] if len(found) > _NOTICE_LINES else []
-            notices.append(notice(title, found[:_NOTICE_LINES] + more))
+        if texts := [line for line in lines if line]:
+            more = [f"… and {len(texts) - _NOTICE_LINES} more"] if len(texts) > _NOTICE_LINES else []
+            notices.append(notice(title, texts[:_NOTICE_LINES] + more))
     return [*notices, *([notice(f"Audits: {shown}.")] if (shown := audits(status)) else [])]
 
 
 def _disks(of_coordinator: DiskUse | None, roots: Sequence[Path]) -> list[dict[str, Any]]:
     """Size and free space of the disks that fill up while runs are played."""
-    found = [] if of_coordinator is None else [("coordinator", "its state folder", of_coordinator)]
+    disks = [] if of_coordinator is None else [("coordinator", "its state folder", of_coordinator)]
     for root in roots:
         with contextlib.suppress(OSError):  # the page of all runs names a folder that cannot be read
             disk = shutil.disk_usage(root)
-            found.append(("this host", str(root), DiskUse(database=0, free=disk.free, total=disk.total)))
+            disks.append(("this host", str(root), DiskUse(database=0, free=disk.free, total=disk.total)))
     return [
         {
             "where": where,
@@ -112,7 +112,7 @@ def _disks(of_coordinator: DiskUse | None, roots: Sequence[Path]) -> list[dict[s
             "total": bytes_text(disk.total),
             "share": 1.0 - disk.free / max(1, disk.total),
         }
-        for where, folder, disk in found
+        for where, folder, disk in disks
     ]
 
 

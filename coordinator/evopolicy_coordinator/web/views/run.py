@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
 from markupsafe import Markup
 
 from evopolicy_common.messages.status import RetriedJobs, StatusReply
-from evopolicy_common.records.model_calls import before
+from evopolicy_common.records import model_calls
 from evopolicy_common.records.policies.trees import changes
 from evopolicy_common.records.summary import utc_text
 from evopolicy_common.terminal import counted, duration, number
@@ -66,11 +67,9 @@ def run_view(
         "messages-more": part("messages_more", earlier=earlier, latest=latest, n=len(messages)),
         "look": part("identity", run=run, look=look, env_title=title_of(run.env)),
     }
-    best, rises = float("-inf"), []
-    for submit in submits:
-        mean = float("-inf") if submit.mean is None else submit.mean
-        rises.append(mean > best)
-        best = max(best, mean)
+    means = [-math.inf if submit.mean is None else submit.mean for submit in submits]
+    before = itertools.accumulate(means, max, initial=-math.inf)
+    rises = [mean > best for mean, best in zip(means, before, strict=False)]
     for submit, rise in list(zip(submits, rises, strict=True))[::-1][:MAX_SUBMITS]:
         shown = {"submit": submit.summary, "consumed": submit.consumed, "best": rise}
         name = f"submit-{submit.summary.submit_index}"
@@ -85,7 +84,7 @@ def run_view(
 
 def _retried(one: RetriedJobs) -> Happened:
     jobs = counted(one.jobs, "job")
-    what = {
+    text = {
         "worker_lost": f"Worker {one.worker} was lost with {jobs} of this run",
         "failed": f"{jobs} failed on worker {one.worker}, through no fault of the policy",
         "overdue": f"Worker {one.worker} held {jobs} for longer than any episode may take",
@@ -93,31 +92,26 @@ def _retried(one: RetriedJobs) -> Happened:
     }.get(one.failure, f"{jobs} on worker {one.worker}: {one.failure}")
     again = "It is played again" if one.jobs == 1 else "They are played again"
     at = utc_text(one.at)[:19].replace("T", " ")
-    return Happened(at=at, level="warning", text=f"{what}. {again}, at no charge.")
+    return Happened(at=at, level="warning", text=f"{text}. {again}, at no charge.")
 
 
 def _run_facts(run: RunFacts, may_show: bool) -> list[tuple[str, str]]:
-    facts = [
-        ("state", state_words(run.state)),
-        ("episodes used", f"{run.used} of {run.budget}" if run.budget else str(run.used)),
-        ("submits", str(run.n_submits)),
-        ("best train return", number(run.best)),
-    ]
-    if may_show and run.score is not None:
-        facts += [("held-out score", number(run.score)), ("random", number(run.random))]
-    if run.running or run.queued:
-        facts.append(("running, queued", f"{run.running}, {run.queued}"))
-    if run.tokens:
-        facts.append(("tokens", short(run.tokens)))
-    if run.cost:
-        facts.append(("cost", f"${run.cost:.2f}"))
-    if run.retries:
-        facts.append(("jobs played again", str(run.retries)))
-    if run.finished and run.wall_s:
-        facts.append(("took", duration(run.wall_s)))
-    elif run.left_s is not None:
-        facts.append(("time left, about", duration(run.left_s)))
-    return facts
+    is_scored, took = may_show and run.score is not None, run.finished and run.wall_s
+    facts = {
+        "state": state_words(run.state),
+        "episodes used": f"{run.used} of {run.budget}" if run.budget else str(run.used),
+        "submits": str(run.n_submits),
+        "best train return": number(run.best),
+        "held-out score": is_scored and number(run.score),
+        "random": is_scored and number(run.random),
+        "running, queued": (run.running or run.queued) and f"{run.running}, {run.queued}",
+        "tokens": run.tokens and short(run.tokens),
+        "cost": run.cost and f"${run.cost:.2f}",
+        "jobs played again": run.retries and str(run.retries),
+        "took": took and duration(run.wall_s),
+        "time left, about": not took and run.remaining_s is not None and duration(run.remaining_s),
+    }
+    return [(name, str(value)) for name, value in facts.items() if value]
 
 
 def _one_run_notices(run: RunFacts, may_show: bool) -> list[dict[str, Any]]:
@@ -125,14 +119,14 @@ def _one_run_notices(run: RunFacts, may_show: bool) -> list[dict[str, Any]]:
     if run.waits_for:
         notices.append(notice(f"It waits for {run.waits_for}."))
     if run.error:
-        title = f"It {state_words(run.state)}" if run.state == "failed" else "Why it ended so"
-        notices.append(notice(title, [run.error]))
+        notices.append(notice("Why it ended so", [run.error]))
     if run.finished and not may_show and run.state == "completed":
         notices.append(notice("Its hidden scores are shown once no agent of a related run is alive."))
     if run.path is None:
         where = f" on {run.host}" if run.host else ""
-        text = f"Its folder is not on this host{where}: only what the cluster tells is shown."
-        notices.append(notice(text))
+        notices.append(
+            notice(f"Its folder is not on this host{where}: only what the cluster tells is shown.")
+        )
     return notices
 
 
@@ -167,8 +161,7 @@ def submit_values(run: RunFacts, reader: Reader, index: int) -> dict[str, Any]:
     code = detail.code(index, checkpoints=may_read)
     previous = detail.code(index - 1, checkpoints=may_read) if index - 1 in submits else ()
     summary, n = detail.summary(index), submit.summary.n_episodes
-    names = ("env_instances", "returns", "episode_lengths")
-    columns = [_numbers(summary.get(name))[:n] for name in names]
+    columns = [_numbers(summary.get(name))[:n] for name in ("env_instances", "returns", "episode_lengths")]
     failed = {int(each) for each in _numbers(summary.get("errors")) if each is not None}
     first, known = summary.get("first_global_episode"), detail.episodes(index)
     begin = first if isinstance(first, int) else known[0] if known else 0
@@ -192,7 +185,7 @@ def submit_values(run: RunFacts, reader: Reader, index: int) -> dict[str, Any]:
         "next": index + 1 if index + 1 in submits else None,
         "diffs": _diffs(previous, code) if previous else [],
         "files": code,
-        "calls": before(run.path, starts)[-1],
+        "calls": model_calls.before(run.path, starts)[-1],
         "workspace": changes(run.path, index),
         "episodes": episodes,
         "left_out": max(0, n - MAX_EPISODES),

@@ -13,7 +13,7 @@ from evopolicy_common.terminal import counted, duration, number
 from evopolicy_coordinator.web.content.cluster import Cluster
 from evopolicy_coordinator.web.content.rendering import STATES, View, part, short, state_words
 from evopolicy_coordinator.web.content.run_folders import RunFacts, Runs, Sweep
-from evopolicy_coordinator.web.content.tables import Words, ident, matches, paged
+from evopolicy_coordinator.web.content.tables import Words, ident, paged
 from evopolicy_results.html import notice
 from evopolicy_results.reading.environments import title_of
 from evopolicy_results.studies.palette import Look, looks
@@ -35,14 +35,7 @@ def sweeps_view(
         name = ident("sweep", str(sweep.root))
         matrix, cells = _matrix(sweep, runs, agents, cells)
         view.row("matrices", "matrix", name, key=name, acting=acting, **matrix)
-    kept = [
-        run
-        for run in sorted(every, key=_order)
-        if matches(
-            words.q, run.entry, run.env, run.exp_id, run.host, state_words(run.state), run.run, run.origin
-        )
-    ]
-    shown, pages = paged(kept, words)
+    shown, pages = paged(sorted(every, key=_order), words, _row_texts)
     view.parts |= {
         "facts": part("facts", facts=_sweep_facts(every)),
         "notices": part("notices", notices=_run_notices(runs, every, cluster, roots)),
@@ -50,17 +43,15 @@ def sweeps_view(
     }
     for run in shown:
         may_show = runs.may_show(run)
-        view.row(
-            "run-rows",
-            "run_row",
-            ident("row", run.key),
-            run=run,
-            look=agents[run.entry],
-            score=run.score if may_show else None,
-            random=run.random if may_show else None,
-            hidden=run.finished and not may_show and run.state == "completed",
-        )
+        score, random = (run.score, run.random) if may_show else (None, None)
+        about = {"run": run, "look": agents[run.entry], "score": score, "random": random}
+        hidden = run.finished and not may_show and run.state == "completed"
+        view.row("run-rows", "run_row", ident("row", run.key), hidden=hidden, **about)
     return view
+
+
+def _row_texts(run: RunFacts) -> tuple[str, ...]:
+    return run.entry, run.env, run.exp_id, run.host, state_words(run.state), run.run, run.origin
 
 
 def _order(run: RunFacts) -> tuple[int, str, str, int]:
@@ -75,7 +66,7 @@ def _sweep_facts(every: Sequence[RunFacts]) -> list[tuple[str, str]]:
     open_runs = [run for run in every if not run.finished and run.state not in ("pending", "interrupted")]
     walls = [run.wall_s for run in every if run.finished and run.wall_s]
     waiting = states["pending"] + states["interrupted"]
-    rest = max((run.left_s for run in open_runs if run.left_s is not None), default=0.0)
+    rest = max((run.remaining_s for run in open_runs if run.remaining_s is not None), default=0.0)
     if walls and waiting:
         rest += sum(walls) / len(walls) * waiting / max(1, len(open_runs))
     facts = [
@@ -107,7 +98,7 @@ def _run_notices(
         shown = "1 finished run keeps its" if hidden == 1 else f"{hidden} finished runs keep their"
         notices.append(notice(f"{shown} hidden scores until no agent of a related run is alive."))
     if waits := Counter(run.waits_for for run in every if run.waits_for):
-        lines = [f"{counted(n, 'run')}: {what}" for what, n in waits.most_common(12)]
+        lines = [f"{counted(n, 'run')}: {reason}" for reason, n in waits.most_common(12)]
         notices.append(notice("Runs wait", lines))
     for root in roots:
         try:
