@@ -25,7 +25,7 @@ from evopolicy_coordinator.core.contract.records import (
     RunStateRow,
     SubmitRow,
     WorkerRow,
-    train_group,
+    submit_group,
 )
 from evopolicy_coordinator.core.leasing import fleet
 from evopolicy_coordinator.core.machine import Core
@@ -162,7 +162,7 @@ class Checkers:
                 (old.key, old.env_instances) == (row.key, row.env_instances), "a submit is constant", old, row
             )
         if row.status == "ok":
-            group = train_group(row.run, row.submit_index)
+            group = submit_group(row.run, row.submit_index, "train")
             new = {each.index for each in rows if isinstance(each, OutcomeRow) and each.group == group}
             have = new | set(self._disk.outcomes.get(group, {}))
             want(have == set(range(len(row.env_instances))), "an ok submit is complete", row, sorted(have))
@@ -204,7 +204,7 @@ class Checkers:
             for result in request.results:
                 self._taken(result)
         elif isinstance(request, gateway.ResultsRequest) and getattr(message, "rows", None):
-            gate = disk.outcome(train_group(request.run, request.submit_index), 0)
+            gate = disk.outcome(submit_group(request.run, request.submit_index, "train"), 0)
             category = None if gate is None or gate.outcome.failure is None else gate.outcome.failure.category
             shown = gate is not None and category != "init_error"
             want(shown, "nothing is shown before index 0 shows a Policy", request, gate)

@@ -31,7 +31,7 @@ from evopolicy_coordinator.core.contract.effects import (
     Refuse,
     Reply,
 )
-from evopolicy_coordinator.core.contract.records import evaluation_group, submit_done, train_group
+from evopolicy_coordinator.core.contract.records import evaluation_group, submit_done, submit_group
 from evopolicy_coordinator.core.contract.settings import CoreSettings
 from evopolicy_coordinator.core.machine import Core
 from evopolicy_coordinator.server.reason_texts import message
@@ -231,7 +231,9 @@ class SimCoordinator:
             case ReadResults():
                 row = self.disk.submits[effect.run, effect.submit_index]
                 upto = row.released if effect.upto is None or row.status is not None else effect.upto
-                rows = self.disk.page(train_group(effect.run, effect.submit_index), effect.cursor, upto, PAGE)
+                rows = self.disk.page(
+                    submit_group(effect.run, effect.submit_index, "train"), effect.cursor, upto, PAGE
+                )
                 cursor = rows[-1].seq + 1 if rows else effect.cursor
                 return Page(rows, cursor, submit_done(row) if cursor >= upto else None)
             case ReadEvaluation():

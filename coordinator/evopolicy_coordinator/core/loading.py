@@ -17,7 +17,7 @@ from evopolicy_coordinator.core.contract.records import (
     RunStateRow,
     Snapshot,
     SubmitRow,
-    validation_group,
+    submit_group,
 )
 from evopolicy_coordinator.core.isolation import occupancies
 from evopolicy_coordinator.core.leasing import fleet, pins
@@ -99,9 +99,9 @@ def _run(state: State, run: Run, rows: list[SubmitRow], loading: Loading, step: 
             run.open = row.submit_index
             submits.play(state, run, row, step)
         if row.status == "ok" and row.val_mean is not None:
-            heads = loading.heads.pop(validation_group(run.id, row.submit_index), [])
+            heads = loading.heads.pop(submit_group(run.id, row.submit_index, "validation"), [])
             failed = sum(head.failure is not None for head in heads)
-            run.hidden_failures[validation_group(run.id, row.submit_index)] = failed
+            run.hidden_failures[submit_group(run.id, row.submit_index, "validation")] = failed
         elif row.status == "ok" and row.ineligible is None:
             finalisation.validate(state, run, row, step)
     audits.resume(state, run, step)

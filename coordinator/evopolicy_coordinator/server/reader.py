@@ -239,7 +239,7 @@ class ServiceReader:
         # The row may have changed since the core's request. An end is reported with all episodes that belong before
         # it.
         upto = row.released if effect.upto is None or row.status is not None else effect.upto
-        group = records.train_group(effect.run, effect.submit_index)
+        group = records.submit_group(effect.run, effect.submit_index, "train")
         page = self._reader.outcomes(group, effect.cursor, upto, MAX_PAGE_BYTES)
         after = _after(page, effect.cursor)
         return ResultsPage(
@@ -269,7 +269,7 @@ class ServiceReader:
         run, index, cursor = message.run, message.submit_index, finite_cursor(message.cursor)
         finished = self._reader.finished(run) is not None
         require(finished, Refusal.UNKNOWN_RUN, f"there is no finished run {run[:64]!r} here")
-        group = records.random_group(run) if index < 0 else records.GROUPS[message.split](run, index)
+        group = records.random_group(run) if index < 0 else records.submit_group(run, index, message.split)
         page = self._reader.outcomes(group, cursor, MAX_COUNT, MAX_PAGE_BYTES)
         after = _after(page, cursor)
         outcomes = tuple(each.outcome for each in page)

@@ -25,6 +25,7 @@ import msgspec
 from evopolicy_common.errors import DECODE_ERRORS, ConfigError, DamagedStoreError, StorageError
 from evopolicy_common.messages.episode import BlobRef, EpisodeOutcome
 from evopolicy_common.messages.operator import RunFinished
+from evopolicy_common.records.splits import SPLITS
 from evopolicy_coordinator.core.contract import records
 
 T = TypeVar("T")
@@ -210,7 +211,8 @@ class Store:
         live_runs = "SELECT run FROM run_states WHERE phase != 'finished'"
         submits = tuple(rows(db, records.SubmitRow, f"WHERE run IN ({live_runs})"))
         evaluations = tuple(rows(db, records.EvaluationRow))
-        groups = [group(row.run, row.submit_index) for row in submits for group in records.GROUPS.values()]
+        places = [(row.run, row.submit_index) for row in submits]
+        groups = [records.submit_group(*place, split) for place in places for split in SPLITS]
         groups += [records.random_group(run) for (run,) in db.execute(live_runs)]
         groups += [records.evaluation_group(row.evaluation) for row in evaluations if not row.finished]
         return records.Snapshot(

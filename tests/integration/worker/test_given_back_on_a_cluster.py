@@ -27,7 +27,7 @@ from evopolicy_common.messages.episode import Job
 from evopolicy_common.records.blobs import BlobStore
 from evopolicy_common.records.episodes.trajectory import decode
 from evopolicy_common.wire.transport import connect
-from evopolicy_coordinator.core.contract.records import BegunRow, OutcomeRow, validation_group
+from evopolicy_coordinator.core.contract.records import BegunRow, OutcomeRow, submit_group
 from evopolicy_worker.capabilities import Capabilities
 from evopolicy_worker.slot_protocol import begun
 from evopolicy_worker.slots.slot import Slot
@@ -177,7 +177,7 @@ def test_an_agent_that_stops_its_validation_again_and_again_gets_one_throw(
             )
             working = asyncio.create_task(worker.run())
             created = await operator.create(env=ENTRY.id, n_validation=1, n_heldout=1)
-            groups = [validation_group(created.run, number) for number in range(N_STOPS + 1)]
+            groups = [submit_group(created.run, number, "validation") for number in range(N_STOPS + 1)]
             stored = Stored(coordinator.state)
 
             def played_further() -> str | None:

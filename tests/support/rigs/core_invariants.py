@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 
-from evopolicy_coordinator.core.contract.records import train_group
+from evopolicy_coordinator.core.contract.records import submit_group
 from evopolicy_coordinator.core.isolation.kernels import all_related, related
 from evopolicy_coordinator.core.structures import InvariantError
 from evopolicy_coordinator.core.tables.model import N_PRIORITIES, TRAIN, JobState
@@ -32,7 +32,11 @@ def check_invariants(state: State) -> None:
         )
         want(run.id, (run.open is not None) == (run.ledger.reserved > 0), "an open submit has a reservation")
         if run.open is not None:
-            want(run.id, train_group(run.id, run.open) in state.groups, "an open submit has its group")
+            want(
+                run.id,
+                submit_group(run.id, run.open, "train") in state.groups,
+                "an open submit has its group",
+            )
         settled = sum(
             len(row.env_instances) for row in run.submits if row.status is not None and not row.refunded
         )

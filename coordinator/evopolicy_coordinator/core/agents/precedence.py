@@ -15,7 +15,7 @@ Rules that this module owns:
 
 from __future__ import annotations
 
-from evopolicy_coordinator.core.contract.records import train_group
+from evopolicy_coordinator.core.contract.records import submit_group
 from evopolicy_coordinator.core.isolation import conflicts, kernels
 from evopolicy_coordinator.core.isolation.kernels import all_related
 from evopolicy_coordinator.core.leasing import leases
@@ -165,7 +165,7 @@ def _train(state: State, lane: Lane, there: dict[Kernel, None], step: Step) -> N
     waiting |= {job.group.run: None for job in state.suspects if job.priority == TRAIN}
     for name in waiting:
         run = state.runs.get(name)
-        open_group = "" if run is None or run.open is None else train_group(run.id, run.open)
+        open_group = "" if run is None or run.open is None else submit_group(run.id, run.open, "train")
         submitted = state.groups.get(open_group)
         if (
             submitted is None

@@ -52,7 +52,8 @@ class ReadResults(msgspec.Struct, frozen=True, kw_only=True):
     """Answer `request` with a `ResultsPage` read from the store.
 
     If the row's status is set when it is read, `upto` is the row's `released`, whatever the effect says: the submit may
-    have ended in the meantime. The page holds the outcomes of `train_group(run, submit_index)` with `cursor <= seq <
+    have ended in the meantime. The page holds the outcomes of `submit_group(run, submit_index,
+    "train")` with `cursor <= seq <
     upto`, in that order, as many as fit; its cursor is one past its last `seq`. It has `done = submit_done(row)` only
     when it reaches `upto`.
     """
@@ -87,9 +88,8 @@ class ReadFinished(msgspec.Struct, frozen=True, kw_only=True):
     run: str
 
 
-class PrepareAudit(msgspec.Struct, frozen=True, kw_only=True):
-    """Store the actions from the recording of outcome `index` of `group` as a separate blob, without observations,
-    rewards or results, and raise `AuditPrepared`. Runs in the background: no request waits for it."""
+class AuditEffect(msgspec.Struct, frozen=True, kw_only=True):
+    """Read recordings for an audit of outcome `index` of `group`, in the background: an event answers later."""
 
     run: str
     audit: str
@@ -98,17 +98,17 @@ class PrepareAudit(msgspec.Struct, frozen=True, kw_only=True):
     stimulus_id: str = ""
 
 
-class CompareAudit(msgspec.Struct, frozen=True, kw_only=True):
-    """Compare the outcome at index 0 of the last group in `replays` with outcome `index` of `group`, and with the
-    replay before it, bit for bit; raise `AuditCompared`. Runs in the background."""
+class PrepareAudit(AuditEffect, frozen=True, kw_only=True):
+    """Store the actions from the outcome's recording as a separate blob, without observations, rewards or results, and
+    raise `AuditPrepared`."""
 
-    run: str
-    audit: str
-    group: str
-    index: int
+
+class CompareAudit(AuditEffect, frozen=True, kw_only=True):
+    """Compare the outcome at index 0 of the last group in `replays` with the audited one, and with the replay before
+    it, bit for bit; raise `AuditCompared`."""
+
     replays: tuple[str, ...]
     """One or two groups of one outcome each."""
-    stimulus_id: str = ""
 
 
 class Log(msgspec.Struct, frozen=True, kw_only=True):
@@ -119,8 +119,5 @@ class Log(msgspec.Struct, frozen=True, kw_only=True):
 
 
 ReadEffect = ReadResults | ReadEvaluation | ReadFinished
-
-AuditEffect = PrepareAudit | CompareAudit
-"""Effects that an event answers later."""
 
 Effect = Persist | Reply | Refuse | ReadEffect | AuditEffect | Log

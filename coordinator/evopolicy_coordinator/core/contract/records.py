@@ -9,7 +9,6 @@ Rules that this module owns:
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any, Literal, TypeVar
 
 import msgspec
@@ -142,7 +141,7 @@ class OutcomeRow(msgspec.Struct, frozen=True, kw_only=True, tag="outcome"):
     """The outcome of one episode. Key: `group`, `index`."""
 
     group: str
-    """The list of cases that the episode belongs to; see `train_group` and its siblings."""
+    """The list of cases that the episode belongs to; see `submit_group` and its siblings."""
     index: int
     """Position in that list: the request index of a train episode."""
     seq: int
@@ -393,26 +392,10 @@ def submit_done(row: SubmitRow) -> SubmitDone | None:
     )
 
 
-def train_group(run: str, submit_index: int) -> str:
-    """Group id of a submit's train episodes; `ReadResults` reads outcomes with this `OutcomeRow.group`."""
-    return f"{run}/s{submit_index}/train"
-
-
-def validation_group(run: str, submit_index: int) -> str:
-    """Group id of a checkpoint's validation episodes."""
-    return f"{run}/s{submit_index}/validation"
-
-
-def heldout_group(run: str, submit_index: int) -> str:
-    """Group id of a checkpoint's held-out episodes."""
-    return f"{run}/s{submit_index}/heldout"
-
-
-GROUPS: dict[Split, Callable[[str, int], str]] = {
-    "train": train_group,
-    "validation": validation_group,
-    "heldout": heldout_group,
-}
+def submit_group(run: str, submit_index: int, split: Split) -> str:
+    """Group id of the episodes of a submit's bundle on a split; `ReadResults` reads outcomes with this
+    `OutcomeRow.group`."""
+    return f"{run}/s{submit_index}/{split}"
 
 
 def random_group(run: str) -> str:

@@ -24,10 +24,8 @@ from evopolicy_coordinator.core.contract.reasons import because
 from evopolicy_coordinator.core.contract.records import (
     FinishedRow,
     SubmitRow,
-    heldout_group,
     random_group,
-    train_group,
-    validation_group,
+    submit_group,
 )
 from evopolicy_coordinator.core.leasing import groups, queue
 from evopolicy_coordinator.core.runs import (
@@ -58,8 +56,8 @@ FAILED_VALIDATION = "its policy failed in a validation episode"
 
 def validate(state: State, run: Run, row: SubmitRow, step: Step) -> None:
     """Queue the validation of an ok checkpoint; in idle slots only while the run is open."""
-    if validation_group(run.id, row.submit_index) not in state.groups:
-        _open(state, templates.validation(run, row, step), step)
+    if submit_group(run.id, row.submit_index, "validation") not in state.groups:
+        _open(state, templates.hidden("validation", run, row, step), step)
 
 
 def _open(state: State, group: JobGroup, step: Step) -> None:
@@ -134,20 +132,21 @@ def advance(state: State, run: Run, step: Step) -> None:
     if finished.unspent(run):
         _finish(state, run, None, step, unplayed=True)
         return
-    has_reference = (
-        random_group(run.id) in run.hidden_returns
-    )  # groups that are opened here end in a later rule
+    # Groups that are opened here end in a later rule.
+    has_reference = random_group(run.id) in run.hidden_returns
     if not has_reference:
         _open(state, templates.random(run, step), step)
     waiting = [row for row in finished.ok_submits(run) if row.val_mean is None and row.ineligible is None]
     for row in waiting:
         validate(state, run, row, step)
-        groups.promote(state, state.groups[validation_group(run.id, row.submit_index)], HELDOUT, step)
+        groups.promote(
+            state, state.groups[submit_group(run.id, row.submit_index, "validation")], HELDOUT, step
+        )
     if waiting:
         return
     best = finished.select(run)
-    if best is not None and heldout_group(run.id, best.submit_index) not in run.hidden_returns:
-        _open(state, templates.heldout(run, best, step), step)
+    if best is not None and submit_group(run.id, best.submit_index, "heldout") not in run.hidden_returns:
+        _open(state, templates.hidden("heldout", run, best, step), step)
         return
     if has_reference and not audits.holds_up(state, run, step):
         _finish(state, run, best, step)
@@ -193,7 +192,7 @@ def _cancel(state: State, run: Run, step: Step, *, error: str | None = None) -> 
         index, run.open = run.open, None
         run.ledger.refund(index)
         step.change_submit(run, index, status="cancelled", completed_at=step.now, refunded=True)
-        group = state.groups[train_group(run.id, index)]
+        group = state.groups[submit_group(run.id, index, "train")]
         groups.close_group(state, group, step)
         result_polls.answer_polls(state, group, step)
     if run.state.phase == "open":

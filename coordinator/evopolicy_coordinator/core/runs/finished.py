@@ -11,11 +11,9 @@ from evopolicy_coordinator.core.contract.effects import ReadFinished
 from evopolicy_coordinator.core.contract.reasons import Reason, because
 from evopolicy_coordinator.core.contract.records import (
     SubmitRow,
-    heldout_group,
     random_group,
     shared,
-    train_group,
-    validation_group,
+    submit_group,
 )
 from evopolicy_coordinator.core.runs import audits, waits
 from evopolicy_coordinator.core.structures.polls import Poll
@@ -27,12 +25,8 @@ from evopolicy_coordinator.core.tables.step import Step
 def unspent(run: Run) -> int:
     """Unspent episodes of a run that must spend its budget; 0 for other runs, or if fewer remain
     than a submit's minimum."""
-    available = run.ledger.available
-    return (
-        available
-        if run.row.settings.finish == "budget" and available >= run.row.min_episodes_per_submit
-        else 0
-    )
+    n = run.ledger.available
+    return n if run.row.settings.finish == "budget" and n >= run.row.min_episodes_per_submit else 0
 
 
 def ok_submits(run: Run) -> list[SubmitRow]:
@@ -74,7 +68,7 @@ def result(
         status = "no_ok_submit"
     elif best is None:
         status, error = "error", "no ok checkpoint is eligible: each brought its slots down while hidden"
-    elif fails(run, failed := run.hidden_failures.get(heldout_group(run.id, best.submit_index), 0)):
+    elif fails(run, failed := run.hidden_failures.get(submit_group(run.id, best.submit_index, "heldout"), 0)):
         status = "error"
         error = (
             f"the selected policy failed in {failed} of {len(row.heldout)} held-out episodes, so the run has no score"
@@ -86,12 +80,12 @@ def result(
     final_score = None
     if best is not None:
         index = best.submit_index
-        heldout = run.hidden_returns[heldout_group(run.id, index)]
-        successes = run.hidden_successes.get(heldout_group(run.id, index), ())
+        heldout = run.hidden_returns[submit_group(run.id, index, "heldout")]
+        successes = run.hidden_successes.get(submit_group(run.id, index, "heldout"), ())
         final_score = mean(heldout) if status == "completed" else None
         failures = {
-            "validation": run.hidden_failures.get(validation_group(run.id, index), 0),
-            "heldout": run.hidden_failures.get(heldout_group(run.id, index), 0),
+            "validation": run.hidden_failures.get(submit_group(run.id, index, "validation"), 0),
+            "heldout": run.hidden_failures.get(submit_group(run.id, index, "heldout"), 0),
         }
     description = stored.description
     closed_at = now if stored.closed_at is None else stored.closed_at
@@ -158,7 +152,7 @@ def answer(state: State, poll: Poll, step: Step) -> None:
 def progress(state: State, run: Run) -> tuple[operator.RunProgress, Reason | None]:
     """Returns the progress of an unfinished run for its operator, and the reason that it waits for."""
     if run.state.phase == "open" or run.open is not None:
-        group = None if run.open is None else state.groups[train_group(run.id, run.open)]
+        group = None if run.open is None else state.groups[submit_group(run.id, run.open, "train")]
         done = run.ledger.settled + (0 if group is None else group.done)
         waits_for = None if group is None else waits.waits_for(state, group)
         if run.state.description is None:  # its gateway cannot serve yet
@@ -166,14 +160,14 @@ def progress(state: State, run: Run) -> tuple[operator.RunProgress, Reason | Non
         return operator.RunProgress(phase="open", done=done, total=run.row.budget), waits_for
     ok = [row for row in ok_submits(run) if row.ineligible is None]
     n = len(run.row.validation)
-    groups = [state.groups.get(validation_group(run.id, row.submit_index)) for row in ok]
+    groups = [state.groups.get(submit_group(run.id, row.submit_index, "validation")) for row in ok]
     done = sum(n if group is None else group.done for group in groups)
     playing = [group for group in groups if group is not None]
     if playing:
         waits_for = waits.waits_for(state, playing[0])
         return operator.RunProgress(phase="validation", done=done, total=n * len(ok)), waits_for
     best = select(run)
-    group = None if best is None else state.groups.get(heldout_group(run.id, best.submit_index))
+    group = None if best is None else state.groups.get(submit_group(run.id, best.submit_index, "heldout"))
     phase: Literal["heldout", "random"] = "heldout"
     if group is None:
         phase, group = "random", state.groups.get(random_group(run.id))

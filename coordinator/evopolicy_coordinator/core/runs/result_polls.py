@@ -6,7 +6,7 @@ from evopolicy_common.messages import gateway
 from evopolicy_coordinator.core.contract import events
 from evopolicy_coordinator.core.contract.effects import ReadResults
 from evopolicy_coordinator.core.contract.reasons import because
-from evopolicy_coordinator.core.contract.records import train_group
+from evopolicy_coordinator.core.contract.records import submit_group
 from evopolicy_coordinator.core.runs import waits
 from evopolicy_coordinator.core.runs.runs import held_s
 from evopolicy_coordinator.core.structures.polls import Poll
@@ -37,7 +37,7 @@ def results(state: State, event: events.Requested[gateway.ResultsRequest], step:
         reason = because("unknown_submit", run=run.id, n=len(run.submits), submit=message.submit_index)
         step.refuse(event.request, reason)
         return
-    target = train_group(run.id, message.submit_index)
+    target = submit_group(run.id, message.submit_index, "train")
     poll = Poll(event.request, "results", target, message.cursor)
     closed = run.submits[message.submit_index].status is not None
     ready = closed or _released(state, target) > message.cursor

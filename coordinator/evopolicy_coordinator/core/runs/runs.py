@@ -17,7 +17,7 @@ from evopolicy_common.messages.status import RetriedJobs
 from evopolicy_coordinator.core.agents import requests
 from evopolicy_coordinator.core.contract import events
 from evopolicy_coordinator.core.contract.reasons import Reason, because
-from evopolicy_coordinator.core.contract.records import RunRow, RunStateRow, shared, train_group
+from evopolicy_coordinator.core.contract.records import RunRow, RunStateRow, shared, submit_group
 from evopolicy_coordinator.core.leasing import pins
 from evopolicy_coordinator.core.runs import journal, waits
 from evopolicy_coordinator.core.structures.ledger import Ledger
@@ -155,7 +155,7 @@ def last_state(row: RunStateRow) -> gateway.RunState:
 
 def held_s(state: State, run: Run, now: float) -> float:
     """Seconds for which hidden jobs held a run's submits."""
-    group = None if run.open is None else state.groups.get(train_group(run.id, run.open))
+    group = None if run.open is None else state.groups.get(submit_group(run.id, run.open, "train"))
     return sum(row.held_s for row in run.submits) + (0.0 if group is None else group.held(now))
 
 
@@ -163,7 +163,7 @@ def run_state(state: State, run: Run, now: float) -> tuple[gateway.RunState, Rea
     """The state that the gateway of an unfinished run is sent, and the reason that its open submit waits for."""
     in_flight, waits_for = None, None
     if run.open is not None:
-        group = state.groups[train_group(run.id, run.open)]
+        group = state.groups[submit_group(run.id, run.open, "train")]
         waits_for = waits.waits_for(state, group)
         in_flight = gateway.SubmitInFlight(
             submit_index=run.open, n_episodes=group.n, n_done=group.done, held_s=group.held(now)

@@ -5,20 +5,19 @@ Rule that this module owns: a group follows from stored rows alone, so it is the
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Literal
 
 from evopolicy_common.messages.environment import Case
 from evopolicy_common.messages.operator import PlayedAs
+from evopolicy_common.messages.run_settings import RunSettings
 from evopolicy_coordinator.core.contract.records import (
     AuditRow,
     EvaluationRow,
     RunRow,
     SubmitRow,
     evaluation_group,
-    heldout_group,
     random_group,
-    train_group,
-    validation_group,
+    submit_group,
 )
 from evopolicy_coordinator.core.leasing.jobs import occurrences
 from evopolicy_coordinator.core.tables.model import (
@@ -49,7 +48,7 @@ def train(run: Run, row: SubmitRow, step: Step) -> JobGroup:
         run,
         tuple(run.row.train[case_id] for case_id in row.env_instances),
         step,
-        id=train_group(run.id, row.submit_index),
+        id=submit_group(run.id, row.submit_index, "train"),
         submit_index=row.submit_index,
         priority=TRAIN,
         stimulus_id=row.stimulus_id,
@@ -64,35 +63,25 @@ def train(run: Run, row: SubmitRow, step: Step) -> JobGroup:
     )
 
 
-def validation(run: Run, row: SubmitRow, step: Step) -> JobGroup:
-    """A checkpoint on all validation cases."""
-    name = validation_group(run.id, row.submit_index)
-    priority = EARLY_VALIDATION if run.state.phase == "open" else HELDOUT
-    return _hidden("validation", run, row, run.row.validation, step, id=name, priority=priority)
-
-
-def heldout(run: Run, row: SubmitRow, step: Step) -> JobGroup:
-    """A checkpoint on all held-out cases."""
-    name, video = heldout_group(run.id, row.submit_index), run.row.settings.recorded_heldout
-    return _hidden("heldout", run, row, run.row.heldout, step, id=name, priority=HELDOUT, video=video)
-
-
-def _hidden(
-    kind: GroupKind, run: Run, row: SubmitRow, cases: tuple[Case, ...], step: Step, **differing: Any
-) -> JobGroup:
-    pool = run.row.settings.hidden_evaluation == "pool"
+def hidden(split: Literal["validation", "heldout"], run: Run, row: SubmitRow, step: Step) -> JobGroup:
+    """A checkpoint on all cases of a hidden split."""
+    settings, cases = run.row.settings, getattr(run.row, split)
+    pool = settings.hidden_evaluation == "pool"
+    early = split == "validation" and run.state.phase == "open"
     return _group(
-        kind,
+        split,
         run,
         cases,
         step,
+        id=submit_group(run.id, row.submit_index, split),
         submit_index=row.submit_index,
+        priority=EARLY_VALIDATION if early else HELDOUT,
         stimulus_id=row.stimulus_id,
         env_meta=env_meta(run, row) | ({"remaining_budget_after": 0} if pool else {}),
         bundle=row.bundle,
         modulo=len(cases) if pool else len(row.env_instances),
-        scope=run.row.settings.policy_scope,
-        **differing,
+        scope=settings.policy_scope,
+        video=settings.recorded_heldout if split == "heldout" else "off",
     )
 
 
@@ -227,12 +216,11 @@ def _group(
 def _conditions(owner: Run | Evaluation) -> dict[str, Any]:
     """How all episodes of a run or an evaluation are played."""
     row = owner.row
-    how = row.settings if isinstance(row, RunRow) else _place(row)
-    tier, limits = (
-        (row.settings.sandbox_tier, row.settings.limits)
-        if isinstance(row, RunRow)
-        else (row.tier, row.limits)
-    )
+    how: RunSettings | PlayedAs
+    if isinstance(row, RunRow):
+        how, tier, limits = row.settings, row.settings.sandbox_tier, row.settings.limits
+    else:
+        how, tier, limits = _place(row), row.tier, row.limits
     shared = {"observations": how.observations, "failed_episodes": how.failed_episodes}
     return {**shared, "tier": tier, "limits": limits}
 

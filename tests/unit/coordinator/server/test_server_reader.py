@@ -24,7 +24,7 @@ from evopolicy_coordinator.server.reader import MAX_PAGE_BYTES, ServiceReader
 from evopolicy_coordinator.server.uploads import Uploads
 from evopolicy_coordinator.storage.store import Store
 
-TRAIN = records.train_group("r-1", 0)
+TRAIN = records.submit_group("r-1", 0, "train")
 
 
 class Rig:
@@ -218,7 +218,7 @@ def test_run_gets_only_the_blobs_that_its_train_feedback_names(rig: Rig) -> None
     rig.blobs.put(b"named")
     rig.blobs.put(b"other")
     rig.store.write(
-        [outcome_row(TRAIN, 0, 0, named), outcome_row(records.heldout_group("r-1", 0), 0, 0, other)]
+        [outcome_row(TRAIN, 0, 0, named), outcome_row(records.submit_group("r-1", 0, "heldout"), 0, 0, other)]
     )
     assert rig.get("r-1", named.digest).data == b"named"
     assert rig.get("r-1", other.digest).status == "unknown_blob"

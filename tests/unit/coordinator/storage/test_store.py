@@ -27,7 +27,7 @@ from evopolicy_coordinator.storage import disk_use
 from evopolicy_coordinator.storage import store as store_module
 from evopolicy_coordinator.storage.store import SCHEMA_VERSION, Reader, Store, train_run
 
-TRAIN = records.train_group("r-1", 0)
+TRAIN = records.submit_group("r-1", 0, "train")
 
 
 @pytest.fixture
@@ -235,7 +235,7 @@ def test_a_run_may_fetch_the_blobs_of_its_own_train_feedback_only(store: Store, 
         [
             outcome_row(TRAIN, 0, 0, stored),
             outcome_row(TRAIN, 1, 1, inline),
-            outcome_row(records.validation_group("r-1", 0), 0, 0, hidden),
+            outcome_row(records.submit_group("r-1", 0, "validation"), 0, 0, hidden),
         ]
     )
     reader = Reader(path)
@@ -246,10 +246,10 @@ def test_a_run_may_fetch_the_blobs_of_its_own_train_feedback_only(store: Store, 
 
 
 def test_only_train_groups_belong_to_a_gateway() -> None:
-    assert train_run(records.train_group("r-1", 12)) == "r-1"
+    assert train_run(records.submit_group("r-1", 12, "train")) == "r-1"
     for group in (
-        records.validation_group("r-1", 0),
-        records.heldout_group("r-1", 0),
+        records.submit_group("r-1", 0, "validation"),
+        records.submit_group("r-1", 0, "heldout"),
         records.random_group("r-1"),
         records.evaluation_group("train"),
     ):
