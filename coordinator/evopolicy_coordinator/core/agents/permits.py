@@ -19,8 +19,9 @@ from evopolicy_common.messages.run_settings import ELSEWHERE
 from evopolicy_coordinator.core.contract.reasons import Reason
 from evopolicy_coordinator.core.contract.records import PermitRow, RunRow, RunStateRow
 from evopolicy_coordinator.core.isolation import conflicts, kernels
-from evopolicy_coordinator.core.isolation.kernels import all_related, put, related, take
+from evopolicy_coordinator.core.isolation.kernels import all_related, put, related
 from evopolicy_coordinator.core.leasing import leases
+from evopolicy_coordinator.core.structures import take
 from evopolicy_coordinator.core.tables.model import Ask, CaseSet, Kernel, Run
 from evopolicy_coordinator.core.tables.state import State
 from evopolicy_coordinator.core.tables.step import Step
@@ -153,10 +154,8 @@ def end(state: State, run: str, step: Step, why: str, *, boot_id: str = "") -> N
 
 
 def _end(state: State, kernel: Kernel, row: PermitRow, step: Step, why: str) -> None:
-    there = state.permits[row.run]
-    _, case_set = there.pop(kernel)
-    if not there:
-        del state.permits[row.run]
+    _, case_set = state.permits[row.run][kernel]
+    take(state.permits, row.run, kernel)
     take(kernel.permits, case_set, row.run)
     step.persist(msgspec.structs.replace(row, ended_at=step.now))
     step.log("info", "permit_ended", run=row.run, host=row.host, boot_id=row.boot_id, why=why)

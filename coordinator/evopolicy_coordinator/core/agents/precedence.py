@@ -19,6 +19,7 @@ from evopolicy_coordinator.core.contract.records import submit_group
 from evopolicy_coordinator.core.isolation import conflicts, kernels
 from evopolicy_coordinator.core.isolation.kernels import all_related
 from evopolicy_coordinator.core.leasing import leases
+from evopolicy_coordinator.core.structures import take
 from evopolicy_coordinator.core.tables.model import (
     EARLY_VALIDATION,
     EVERYWHERE,
@@ -142,7 +143,7 @@ def release_kernel(state: State, reversal: Reversal, step: Step, why: str) -> No
     """Release a reserved kernel: agents have precedence again."""
     kernel, case_set = reversal.kernel, reversal.case_set
     del reversal.lane.reversals[case_set]
-    kernels.take(kernel.reversals, case_set, str(reversal.lane.key))
+    take(kernel.reversals, case_set, str(reversal.lane.key))
     step.log("info", "agents_first", env=reversal.lane.key[0], boot_id=kernel.boot_id, why=why)
     kernels.freed(state, case_set, step)
     kernels.tidy(state, kernel)

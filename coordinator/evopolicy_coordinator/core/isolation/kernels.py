@@ -77,12 +77,3 @@ def all_related(index: dict[CaseSet | None, dict[str, T]], case_set: CaseSet | N
 def put(index: dict[CaseSet | None, dict[str, T]], case_set: CaseSet | None, name: str, what: T) -> None:
     """Enter `what` under its case set and name."""
     index.setdefault(case_set, {})[name] = what
-
-
-def take(index: dict[CaseSet | None, dict[str, T]], case_set: CaseSet | None, name: str) -> T | None:
-    """Remove and return the entry under a case set and name; None when it is missing."""
-    there = index.get(case_set)
-    taken = None if there is None else there.pop(name, None)
-    if there is not None and not there:
-        del index[case_set]
-    return taken

@@ -16,8 +16,9 @@ from collections.abc import Iterable
 from evopolicy_common.messages.worker import HeldLease
 from evopolicy_coordinator.core.contract.records import KernelRow
 from evopolicy_coordinator.core.isolation import kernels
-from evopolicy_coordinator.core.isolation.kernels import put, related, take
-from evopolicy_coordinator.core.tables.model import Lease, Occupancies, Occupancy, Worker
+from evopolicy_coordinator.core.isolation.kernels import put, related
+from evopolicy_coordinator.core.structures import take
+from evopolicy_coordinator.core.tables.model import Lease, Occupancies, Occupancy, Worker, add
 from evopolicy_coordinator.core.tables.state import State
 from evopolicy_coordinator.core.tables.step import Step
 
@@ -40,7 +41,7 @@ def _enter(occupancy: Occupancy) -> None:
     if case_set is not None:
         case_set.users += 1
         if occupancy.hidden:
-            case_set.hidden_on[occupancy.kernel] = case_set.hidden_on.get(occupancy.kernel, 0) + 1
+            add(case_set.hidden_on, occupancy.kernel, 1)
     put(_index(occupancy), case_set, occupancy.key, occupancy)
 
 
@@ -56,10 +57,8 @@ def vacate(state: State, lease: Lease, worker: Worker, step: Step, *, sure: bool
     occupancy.lease = None
     if sure:
         _gone(state, occupancy, step)
-        return
-    occupancy.until = max(worker.last_seen, lease.granted_at) + state.settings.silent_bar_s
-    state.lingering.setdefault(occupancy.worker, {})[occupancy.id] = occupancy
-    state.timers.arm_once(("linger", occupancy.worker), occupancy.until)
+    else:
+        _linger(state, occupancy, max(worker.last_seen, lease.granted_at))
 
 
 def _gone(state: State, occupancy: Occupancy, step: Step) -> None:
@@ -67,11 +66,7 @@ def _gone(state: State, occupancy: Occupancy, step: Step) -> None:
     index, case_set = _index(occupancy), occupancy.case_set
     take(index, case_set, occupancy.key)
     if occupancy.hidden and case_set is not None:
-        n_hidden = case_set.hidden_on[occupancy.kernel] - 1
-        if n_hidden:
-            case_set.hidden_on[occupancy.kernel] = n_hidden
-        else:
-            del case_set.hidden_on[occupancy.kernel]
+        add(case_set.hidden_on, occupancy.kernel, -1)
     if not related(index, case_set):
         kernels.freed(state, case_set, step, train_too=occupancy.hidden)
     kernels.tidy(state, occupancy.kernel)
@@ -80,10 +75,7 @@ def _gone(state: State, occupancy: Occupancy, step: Step) -> None:
 
 def forget(state: State, occupancy: Occupancy, step: Step) -> None:
     """Remove a lingering occupancy that has surely ended."""
-    there = state.lingering[occupancy.worker]
-    del there[occupancy.id]
-    if not there:
-        del state.lingering[occupancy.worker]
+    take(state.lingering, occupancy.worker, occupancy.id)
     _gone(state, occupancy, step)
 
 
@@ -129,12 +121,14 @@ def unknown(state: State, worker: Worker, item: HeldLease, step: Step) -> None:
         run = state.runs.get(item.job_id.partition("/")[0])
         case_set = None if run is None else run.flow.case_set
     place = (worker.name, worker.kernel, worker.machine, case_set)
-    _linger(state, Occupancy(item.lease_id, *place, not train, None), step)
-
-
-def _linger(state: State, occupancy: Occupancy, step: Step) -> None:
-    occupancy.until = step.now + state.settings.silent_bar_s
+    occupancy = Occupancy(item.lease_id, *place, not train, None)
     _enter(occupancy)
+    _linger(state, occupancy, step.now)
+
+
+def _linger(state: State, occupancy: Occupancy, since: float) -> None:
+    """Keep an occupancy whose worker may have been silent since then."""
+    occupancy.until = since + state.settings.silent_bar_s
     state.lingering.setdefault(occupancy.worker, {})[occupancy.id] = occupancy
     state.timers.arm_once(("linger", occupancy.worker), occupancy.until)
 
@@ -179,4 +173,6 @@ def load(state: State, known_kernels: Iterable[KernelRow], step: Step) -> None:
             if hidden and not known.boot_id:
                 continue
             name = f"{known.worker} before, {'hidden' if hidden else 'train'}"
-            _linger(state, Occupancy(name, known.worker, kernel, known.machine, None, hidden, None), step)
+            occupancy = Occupancy(name, known.worker, kernel, known.machine, None, hidden, None)
+            _enter(occupancy)
+            _linger(state, occupancy, step.now)

@@ -18,7 +18,9 @@ from __future__ import annotations
 
 import hashlib
 import hmac
+import itertools
 import json
+from collections import defaultdict
 from collections.abc import Iterable
 
 from evopolicy_common.messages.environment import Case, EnvironmentDescription
@@ -91,10 +93,5 @@ def reference_seed(split: str, case: Case, occurrence: int) -> bytes:
 
 def occurrences(case_ids: Iterable[int]) -> tuple[int, ...]:
     """Returns, for each position, how often its case id occurs earlier in the list."""
-    seen: dict[int, int] = {}
-    counts: list[int] = []
-    for case_id in case_ids:
-        count = seen.get(case_id, 0)
-        counts.append(count)
-        seen[case_id] = count + 1
-    return tuple(counts)
+    seen: dict[int, itertools.count[int]] = defaultdict(itertools.count)
+    return tuple(next(seen[case_id]) for case_id in case_ids)

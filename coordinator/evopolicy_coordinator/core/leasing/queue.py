@@ -123,11 +123,10 @@ def _enter(flow: Flow, lane: Lane, priority: int) -> None:
 
 def _settle(lane: Lane) -> None:
     """Update in the lane's profiles whether it has waiting jobs."""
-    if any(lane.n_ready):
-        for profile in lane.profiles:
+    for profile in lane.profiles:
+        if any(lane.n_ready):
             profile.busy[lane] = None
-    else:
-        for profile in lane.profiles:
+        else:
             profile.busy.pop(lane, None)
 
 
@@ -289,9 +288,7 @@ def _first(flow: Flow, priority: int, worker: Worker, now: float, *, sole: bool)
 def head(lane: Lane, priority: int) -> JobState | None:
     """The lane's first job at one priority, for any worker; None when none waits."""
     flow = lane.top(priority) if lane.n_ready[priority] else None
-    if flow is None:
-        return None
-    return _next(flow, priority)
+    return None if flow is None else _next(flow, priority)
 
 
 def avoided(lane: Lane, priority: int, now: float) -> str | None:

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from evopolicy_coordinator.core.contract.events import RequestId
+from evopolicy_coordinator.core.structures import take
 from evopolicy_coordinator.core.structures.timers import Timers
 
 PollKind = Literal["results", "evaluation", "run", "permit"]
@@ -49,10 +50,7 @@ class Polls:
         poll = self._polls.pop(request, None)
         if poll is not None:
             self._timers.disarm(("poll", request))
-            waiting = self._of[poll.target]
-            del waiting[request]
-            if not waiting:
-                del self._of[poll.target]
+            take(self._of, poll.target, request)
         return poll
 
     def take_all(self, target: str) -> list[Poll]:

@@ -8,7 +8,9 @@ from __future__ import annotations
 
 import heapq
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any, Literal, NamedTuple, TypeVar
 
 import msgspec
@@ -63,6 +65,12 @@ HIDDEN_FIRST = ((HELDOUT,), (HIDDEN_AUDIT,), (TRAIN,), (REFERENCE,), (EARLY_VALI
 HIDDEN = frozenset((HELDOUT, EARLY_VALIDATION, HIDDEN_AUDIT))
 """Jobs with a policy's present or recorded actions on hidden cases: never on a kernel with an agent that could learn
 of them (`isolation`)."""
+
+
+def by_priority(make: Callable[[], Any]) -> list[Any]:
+    """A value for each priority."""
+    return [make() for _ in range(N_PRIORITIES)]
+
 
 GroupKind = Literal["train", "validation", "heldout", "random", "evaluation", "audit"]
 
@@ -351,13 +359,11 @@ class Flow:
     """Fingerprint class; None until a worker offers one."""
     description: EnvironmentDescription | None = None
     lane: Lane | None = None
-    served: list[float] = field(default_factory=lambda: [0.0] * N_PRIORITIES)
+    served: list[float] = field(default_factory=partial(by_priority, float))
     """Virtual time by priority: slot seconds leased, counted from the clock's value when the flow became active."""
-    ready: tuple[deque[tuple[int, JobState]], ...] = field(
-        default_factory=lambda: tuple(deque() for _ in range(N_PRIORITIES))
-    )
-    n_ready: list[int] = field(default_factory=lambda: [0] * N_PRIORITIES)
-    in_heap: list[bool] = field(default_factory=lambda: [False] * N_PRIORITIES)
+    ready: list[deque[tuple[int, JobState]]] = field(default_factory=partial(by_priority, deque))
+    n_ready: list[int] = field(default_factory=partial(by_priority, int))
+    in_heap: list[bool] = field(default_factory=partial(by_priority, bool))
     n_leased: int = 0
     episode_s: float | None = None
     """Moving average of an episode's wall time; None before the first."""
@@ -376,13 +382,9 @@ class Lane:
     """Flows that the same workers can serve."""
 
     key: LaneKey
-    heaps: tuple[list[tuple[float, int, Flow]], ...] = field(
-        default_factory=lambda: tuple([] for _ in range(N_PRIORITIES))
-    )
-    n_ready: list[int] = field(default_factory=lambda: [0] * N_PRIORITIES)
-    waiting: tuple[dict[CaseSet | None, int], ...] = field(
-        default_factory=lambda: tuple({} for _ in range(N_PRIORITIES))
-    )
+    heaps: list[list[tuple[float, int, Flow]]] = field(default_factory=partial(by_priority, list))
+    n_ready: list[int] = field(default_factory=partial(by_priority, int))
+    waiting: list[dict[CaseSet | None, int]] = field(default_factory=partial(by_priority, dict))
     """Waiting jobs, suspects included, by priority and case set."""
     backlog: dict[CaseSet, int] = field(default_factory=dict)
     """The hidden ones of closed flows among them."""
@@ -457,9 +459,7 @@ class Profile:
     """Workers whose lease poll waits and could be answered now, oldest first."""
     warm: dict[str, dict[str, None]] = field(default_factory=dict)
     """Warm environment or bundle digest to the workers in `parked` that have it."""
-    hidden: tuple[dict[Lease, None], ...] = field(
-        default_factory=lambda: tuple({} for _ in range(N_PRIORITIES))
-    )
+    hidden: list[dict[Lease, None]] = field(default_factory=partial(by_priority, dict))
     """Live leases of its workers that may be preempted, by priority, oldest first."""
 
     def offers(self, flow: Flow) -> bool:
@@ -611,7 +611,7 @@ class Worker:
     state: Literal["active", "paused", "draining", "lost", "quarantined"] = "active"
     leases: dict[str, Lease] = field(default_factory=dict)
     """By id, oldest first; also given-up ones until the worker no longer names them."""
-    held: list[int] = field(default_factory=lambda: [0] * N_PRIORITIES)
+    held: list[int] = field(default_factory=partial(by_priority, int))
     """Live leases by priority."""
     n_live: int = 0
     """Live leases in all."""

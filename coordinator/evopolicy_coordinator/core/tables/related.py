@@ -9,6 +9,7 @@ import json
 from collections.abc import Iterable
 
 from evopolicy_common.messages.environment import Case
+from evopolicy_coordinator.core.structures import take
 from evopolicy_coordinator.core.tables.model import CaseKey, CaseSet
 
 
@@ -56,6 +57,4 @@ class CaseSets:
             if other is not case_set:
                 del other.relatives[case_set]
         for key in case_set.cases:
-            del self._of_case[key][case_set]
-            if not self._of_case[key]:
-                del self._of_case[key]
+            take(self._of_case, key, case_set)

@@ -339,7 +339,7 @@ def _of_entry(entry: Entry) -> dict[str, Any]:
         "repeat": entry.repeat,
         "attempt": entry.attempt,
         "tokens": sum(int(each.get(name) or 0) for each in tokens for name in _TOKENS),
-        "cost": sum(float(each.get("cost") or 0.0) for each in tokens),
+        "cost": sum((float(each.get("cost") or 0.0) for each in tokens), 0.0),
         "error": entry.error or "",
         "host": entry.host,
     }
