@@ -51,7 +51,7 @@ the blobs that its outcomes name. Inline trajectories are part of the outcome. T
 blobs, as long as digests stay the same.
 
 *Status* is read, not an event: `core.status(now, words)` returns workers, runs, stalls, episodes done and their rate as
-the parts of a `StatusReply`.
+fields of a `StatusReply`.
 
 *Memory.* A core holds open work only: for each open group of episodes their returns and order of arrival, for each
 unfinished run its submits without their episodes, for each finished run its key and capability. `ReadResults` and

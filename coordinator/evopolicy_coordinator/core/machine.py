@@ -13,6 +13,7 @@ from typing import Any
 
 from evopolicy_common.messages import gateway, operator
 from evopolicy_common.messages import worker as wire
+from evopolicy_common.messages.status import StatusReply
 from evopolicy_coordinator.core import loading, status
 from evopolicy_coordinator.core.agents import permits, precedence, requests
 from evopolicy_coordinator.core.contract import events
@@ -32,7 +33,7 @@ from evopolicy_coordinator.core.runs import (
     runs,
     submits,
 )
-from evopolicy_coordinator.core.status import CoreStatus, Words
+from evopolicy_coordinator.core.status import Words
 from evopolicy_coordinator.core.tables import step
 from evopolicy_coordinator.core.tables.model import LaneKey
 from evopolicy_coordinator.core.tables.state import State
@@ -93,8 +94,8 @@ class Core:
         """Returns why a run that is not open refuses further requests."""
         return requests.over(self.state, run)
 
-    def status(self, now: float, words: Words) -> CoreStatus:
-        """Returns the core's part of a `StatusReply`; `words` puts a reason into words."""
+    def status(self, now: float, words: Words) -> StatusReply:
+        """Returns a reply with the core's fields; `words` puts a reason into words."""
         return status.status(self.state, now, words)
 
     # ---- a step ----

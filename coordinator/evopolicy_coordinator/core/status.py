@@ -7,9 +7,8 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable
-from typing import NamedTuple
 
-from evopolicy_common.messages.status import QueuedJobs, RunStatus, WorkerStatus
+from evopolicy_common.messages.status import QueuedJobs, RunStatus, StatusReply, WorkerStatus
 from evopolicy_coordinator.core.agents import permits
 from evopolicy_coordinator.core.contract.reasons import Reason
 from evopolicy_coordinator.core.contract.records import shared
@@ -33,27 +32,8 @@ Words = Callable[[Reason | None], str]
 """Puts a reason into words; returns an empty string for None."""
 
 
-class CoreStatus(NamedTuple):
-    """The core's part of a `StatusReply`."""
-
-    episodes_done: int
-    """Since the core was loaded."""
-    episodes_per_s: float
-    """Average over the last minute."""
-    workers: tuple[WorkerStatus, ...]
-    runs: tuple[RunStatus, ...]
-    stalls: tuple[str, ...]
-    audit_share: float
-    audits: dict[str, int]
-    """Audit state to number of audits, of the unfinished runs."""
-    disputes: tuple[str, ...]
-    quarantined: dict[str, str]
-    queue: tuple[QueuedJobs, ...]
-    """Highest priority first."""
-
-
-def status(state: State, now: float, words: Words) -> CoreStatus:
-    """Returns the core's part of a `StatusReply`; `words` puts a reason into words."""
+def status(state: State, now: float, words: Words) -> StatusReply:
+    """Returns a reply with the core's fields; the shell adds its own. `words` puts a reason into words."""
     # Computed once per profile and once per run: thousands of workers have few profiles, and hundreds of runs
     # share the groups.
     refused = {
@@ -70,7 +50,10 @@ def status(state: State, now: float, words: Words) -> CoreStatus:
             waits[group] = reason
     workers = tuple(_worker(state, worker, now, refused[worker.profile]) for worker in state.workers.values())
     runs = tuple(_run(state, run, groups.get(run.id, []), waits, words) for run in state.runs.values())
-    return CoreStatus(
+    return StatusReply(
+        cluster="",
+        version="",
+        uptime_s=0.0,
         episodes_done=state.rate.total,
         episodes_per_s=state.rate.per_s(now),
         workers=workers,

@@ -6,7 +6,7 @@ Rules that this module owns:
   only a few times in a row.
 - A failure that it cannot recover from (a store that cannot be loaded for another reason, a failure that recurs after
   each load, a failure of the service itself) ends the process with the reason. Its supervisor restarts it from the
-  state on disk. See `failure`.
+  state on disk. See `failed`.
 - `now` is Unix time at the start, but no earlier than the latest time on disk, advanced by the monotonic clock. A
   change of the wall clock has no effect.
 """
@@ -78,7 +78,8 @@ class CoreHost:
         self._n_failures = 0
         """Failures of the core, each within `_SOON_S` of the one before."""
         self._failed_at = 0.0
-        self._failed: asyncio.Future[None] = self._loop.create_future()
+        self.failed: asyncio.Future[None] = self._loop.create_future()
+        """Ends with PartFailedError and the reason when a part of the service cannot continue."""
         self._unix_offset = time.time() - self._loop.time()
 
     def now(self) -> float:
@@ -125,17 +126,13 @@ class CoreHost:
             # Returns after all work submitted before it, including the flush that this work triggers.
             await self._writer.call(lambda store: None)
 
-    async def failure(self) -> None:
-        """Never returns. Raises PartFailedError with the reason when a part of the service cannot continue."""
-        await asyncio.shield(self._failed)
-
     def fail(self, part: str, error: BaseException) -> PartFailedError:
         """Stops serving, as the process must end. The state on disk stays, and the next process starts from it."""
         log.error("a part of the coordinator failed", part=part, exc_info=error)
         failed = PartFailedError(f"{part} failed: {type(error).__name__}: {error}")
-        if not self._failed.done():
-            self._failed.set_exception(failed)
-            self._failed.exception()  # mark as retrieved: nothing may await it, as during the start
+        if not self.failed.done():
+            self.failed.set_exception(failed)
+            self.failed.exception()  # mark as retrieved: nothing may await it, as during the start
         self._forget()
         return failed
 

@@ -14,7 +14,7 @@ Rules that this module owns:
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 
 import msgspec
@@ -146,21 +146,21 @@ class Definitions:
 
     def offered(self, workers: Iterable[Worker]) -> list[OfferedEnvironment]:
         """Every definition of every environment that connected workers offer."""
-        listed: dict[tuple[str, str], OfferedEnvironment] = {}
-        for worker in workers:
-            if worker.state == "lost":
-                continue
-            profile = worker.profile
-            for env, description in profile.descriptions.items():
-                digest = digits(description)
-                known = listed.get((env, digest))
-                listed[env, digest] = OfferedEnvironment(
-                    description=description,
-                    digest=digest,
-                    accepted=self._word(env, digest),
-                    workers=(*(known.workers if known else ()), worker.name),
-                )
-        return [listed[key] for key in sorted(listed)]
+        offering: dict[tuple[str, str], tuple[EnvironmentDescription, list[str]]] = {}
+        for worker in _connected(workers):
+            for env, description in worker.profile.descriptions.items():
+                key = (env, digits(description))
+                _, names = offering.get(key, (description, []))
+                offering[key] = description, [*names, worker.name]
+        return [
+            OfferedEnvironment(
+                description=description,
+                digest=digest,
+                accepted=self._word(env, digest),
+                workers=tuple(names),
+            )
+            for (env, digest), (description, names) in sorted(offering.items(), key=lambda each: each[0])
+        ]
 
     def _word(self, env: str, digest: str) -> str:
         if env in self._shipped:
@@ -168,6 +168,10 @@ class Definitions:
         if self._trusting:
             return "trusted"
         return "approved" if digest in self.approved.get(env, []) else "by digest only"
+
+
+def _connected(workers: Iterable[Worker]) -> Iterator[Worker]:
+    return (each for each in workers if each.state != "lost")
 
 
 def _offers(env: str, workers: Iterable[Worker]) -> list[str]:
@@ -180,21 +184,19 @@ def undescribed(workers: Iterable[Worker]) -> dict[str, tuple[str, ...]]:
     """By environment that no connected worker has described yet, the workers that will."""
     offering: dict[str, list[str]] = {}
     described: set[str] = set()
-    for worker in workers:
-        if worker.state != "lost":
-            described |= worker.profile.descriptions.keys()
-            for env in worker.undescribed:
-                offering.setdefault(env, []).append(worker.name)
+    for worker in _connected(workers):
+        described |= worker.profile.descriptions.keys()
+        for env in worker.undescribed:
+            offering.setdefault(env, []).append(worker.name)
     return {env: tuple(sorted(offering[env])) for env in sorted(offering.keys() - described)}
 
 
 def failed(workers: Iterable[Worker]) -> dict[str, dict[str, str]]:
     """By environment, the connected workers on which it failed, with the reasons."""
     failures: dict[str, dict[str, str]] = {}
-    for worker in workers:
-        if worker.state != "lost":
-            for env, why in worker.failed_environments.items():
-                failures.setdefault(env, {})[worker.name] = why
+    for worker in _connected(workers):
+        for env, why in worker.failed_environments.items():
+            failures.setdefault(env, {})[worker.name] = why
     return dict(sorted(failures.items()))
 
 

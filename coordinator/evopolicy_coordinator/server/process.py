@@ -9,6 +9,7 @@ import asyncio
 import contextlib
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import msgspec
 
@@ -140,15 +141,14 @@ async def run(options: Options, stop: asyncio.Event, on_ready: Callable[[Ready],
 
 async def _until(stop: asyncio.Event, service: Service) -> None:
     """Waits for `stop`. Raises PartFailedError as soon as the service cannot continue."""
-    waiting = [asyncio.ensure_future(stop.wait()), asyncio.ensure_future(service.host.failure())]
+    stopped = asyncio.create_task(stop.wait())
+    waiting: set[asyncio.Future[Any]] = {stopped, service.host.failed}
     try:
         done, _ = await asyncio.wait(waiting, return_when=asyncio.FIRST_COMPLETED)
-        for task in done:
-            task.result()
+        for each in done:
+            each.result()
     finally:
-        for task in waiting:
-            task.cancel()
-        await asyncio.gather(*waiting, return_exceptions=True)
+        stopped.cancel()
 
 
 def _listen(

@@ -357,23 +357,24 @@ class Service:
 
     def _status(self, core: Core) -> StatusReply:
         now = self.host.now()
-        part = core.status(now, operator_words)._asdict()
-        part["stalls"] = self._stalls(part["stalls"])
-        part["runs"] = tuple(
-            replace(run, silent_s=now - max(run.created_at, self._heard.get(run.run, self._started_at)))
-            if run.phase == "open"
-            else run
-            for run in part["runs"]
-        )
-        return StatusReply(
+        reply = core.status(now, operator_words)
+        heard = {
+            run.run: max(run.created_at, self._heard.get(run.run, self._started_at)) for run in reply.runs
+        }
+        return replace(
+            reply,
             cluster=self._cluster,
             version=metadata.version("evopolicy"),
-            uptime_s=self.host.now() - self._started_at,
-            turned_away=self._refused_workers.recent(self.host.now()),
+            uptime_s=now - self._started_at,
+            runs=tuple(
+                replace(run, silent_s=now - heard[run.run]) if run.phase == "open" else run
+                for run in reply.runs
+            ),
+            stalls=self._stalls(reply.stalls),
+            turned_away=self._refused_workers.recent(now),
             disk=self._disk,
             cost_s=self._status_cost_s,
             trouble=self._trouble,
-            **part,
         )
 
     def _refuse(self, query: IncomingQuery, error: RefusedError) -> None:

@@ -17,6 +17,7 @@ from evopolicy_common.messages.episode import (
 )
 from evopolicy_common.messages.operator import RunFinished
 from evopolicy_common.messages.run_settings import RunSettings
+from evopolicy_common.messages.status import StatusReply
 from evopolicy_common.messages.worker import Message
 from evopolicy_coordinator.core.contract import events
 from evopolicy_coordinator.core.contract.effects import (
@@ -51,7 +52,6 @@ from evopolicy_coordinator.core.contract.records import (
 )
 from evopolicy_coordinator.core.contract.settings import CoreSettings
 from evopolicy_coordinator.core.machine import Core
-from evopolicy_coordinator.core.status import CoreStatus
 from evopolicy_coordinator.server.reason_texts import message, words
 from evopolicy_coordinator.storage.store import _PLACES, _VALUES
 from rigs.asking import asked
@@ -322,7 +322,7 @@ class Rig:
 
     # ---- reading ----
 
-    def status(self) -> CoreStatus:
+    def status(self) -> StatusReply:
         """An operator's view of the status."""
         return self.core.status(self.now, words)
 

@@ -9,7 +9,6 @@ import pytest
 from prometheus_client.parser import text_string_to_metric_families
 from rigs.core_rig import Rig, done
 
-from evopolicy_common.messages.status import StatusReply
 from evopolicy_coordinator.core.contract.effects import Effect
 from evopolicy_coordinator.server.monitoring.metrics import Meter
 
@@ -21,9 +20,7 @@ class MeteredRig(Rig):
 
     def __init__(self, state: Path) -> None:
         super().__init__()
-        self.meter = Meter(
-            state, lambda: StatusReply(cluster="c", version="1", uptime_s=1.0, **self.status()._asdict())
-        )
+        self.meter = Meter(state, self.status)
 
     def _carry_out(self, effects: list[Effect]) -> None:
         if hasattr(self, "meter"):

@@ -258,7 +258,7 @@ async def test_a_poll_given_up_during_a_blocked_loop_gets_no_lease(tmp_path: Pat
 async def failed(world: World) -> str:
     """Why the service cannot go on."""
     with pytest.raises(PartFailedError) as error:
-        await asyncio.wait_for(world.service.host.failure(), 20)
+        await asyncio.wait_for(asyncio.shield(world.service.host.failed), 20)
     return str(error.value)
 
 
