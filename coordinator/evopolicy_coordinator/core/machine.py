@@ -18,7 +18,7 @@ from evopolicy_coordinator.core import loading, status
 from evopolicy_coordinator.core.agents import permits, precedence, requests
 from evopolicy_coordinator.core.contract import events
 from evopolicy_coordinator.core.contract.effects import Effect
-from evopolicy_coordinator.core.contract.reasons import Reason
+from evopolicy_coordinator.core.contract.reasons import NotDoneError, Reason
 from evopolicy_coordinator.core.contract.records import Snapshot
 from evopolicy_coordinator.core.contract.settings import CoreSettings
 from evopolicy_coordinator.core.isolation import occupancies
@@ -66,7 +66,11 @@ class Core:
         """Process an event; the shell carries out the returned effects in order."""
         self._watch(now)
         this = Step(now, event.stimulus_id)
-        EVENTS[type(event.message if isinstance(event, events.Requested) else event)](self.state, event, this)
+        try:
+            EVENTS[type(getattr(event, "message", event))](self.state, event, this)
+        except NotDoneError as refused:
+            assert isinstance(event, events.Requested)
+            this.refuse(event.request, refused.reason)
         return self._end(this)
 
     def next_deadline(self) -> float | None:

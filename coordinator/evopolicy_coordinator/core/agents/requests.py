@@ -6,7 +6,7 @@ from evopolicy_common.messages import gateway, operator
 from evopolicy_common.messages.run_settings import ELSEWHERE, HiddenIsolation
 from evopolicy_coordinator.core.agents import permits
 from evopolicy_coordinator.core.contract import events
-from evopolicy_coordinator.core.contract.reasons import Reason, because
+from evopolicy_coordinator.core.contract.reasons import NotDoneError, Reason, because
 from evopolicy_coordinator.core.contract.records import PermitRow, RunRow
 from evopolicy_coordinator.core.isolation import conflicts, kernels
 from evopolicy_coordinator.core.structures.polls import Poll
@@ -21,12 +21,19 @@ MAX_PLACES = 16
 hostile gateway could keep hidden jobs from every kernel, and add rows without end."""
 
 
-def live(state: State, request: events.RequestId, name: str, step: Step) -> Run | None:
-    """Returns the unfinished run of that name; otherwise refuses the request and returns None."""
+def live(state: State, name: str) -> Run:
+    """Returns the unfinished run of that name. Raises NotDoneError for any other."""
     run = state.runs.get(name)
     if run is None:
-        step.refuse(request, over(state, name))
+        raise NotDoneError(over(state, name))
     return run
+
+
+def known(state: State, name: str) -> Run | None:
+    """Returns the run of that name; None for a finished one. Raises NotDoneError for an unknown one."""
+    if name not in state.capabilities:
+        raise NotDoneError("unknown_run", run=name)
+    return state.runs.get(name)
 
 
 def over(state: State, name: str) -> Reason:
@@ -49,16 +56,14 @@ def requested(state: State, event: events.Requested[gateway.RequestPermit], step
     message = event.message
     run = state.runs.get(message.run)
     if run is None or run.state.phase != "open":
-        step.refuse(event.request, over(state, message.run))
-        return
+        raise NotDoneError(over(state, message.run))
     kernel = permits.place(run, message.boot_id)
     if kernel is None:
         step.reply(event.request, gateway.Permit(granted=True))
         return
     places = permits.places(state, run.id)
     if kernel not in places and len(places) >= MAX_PLACES:
-        step.refuse(event.request, because("too_many_places", run=run.id, n=MAX_PLACES))
-        return
+        raise NotDoneError("too_many_places", run=run.id, n=MAX_PLACES)
     row = PermitRow(run=run.id, boot_id=kernel, host=message.host if kernel == message.boot_id else "")
     waits_for = permits.ask(state, run, row, step)
     if waits_for is None:
@@ -77,13 +82,11 @@ def answer(state: State, poll: Poll, step: Step) -> None:
     step.reply(poll.request, gateway.Permit(granted=False), waits_for)
 
 
-def without_permit(state: State, request: events.RequestId, run: Run, step: Step) -> bool:
-    """Refuse a request for now (UNAVAILABLE) while its run's agent, which may be on any machine, lacks a permit.
-    Returns whether it was refused."""
+def demand_permit(state: State, run: Run, step: Step) -> None:
+    """Refuse a request for now (UNAVAILABLE) while its run's agent, which may be on any machine, lacks a permit."""
     waits_for = _implied(state, run, step) if run.state.phase == "open" else None
     if waits_for is not None:
-        step.refuse(request, because("may_not_start", waits_for=waits_for))
-    return waits_for is not None
+        raise NotDoneError("may_not_start", waits_for=waits_for)
 
 
 def _implied(state: State, run: Run, step: Step) -> Reason | None:
@@ -101,9 +104,7 @@ def _implied(state: State, run: Run, step: Step) -> Reason | None:
 def agent_gone(state: State, event: events.Requested[operator.AgentGone], step: Step) -> None:
     """An operator confirms that a run's agent is no longer alive."""
     message = event.message
-    if message.run not in state.capabilities:
-        step.refuse(event.request, because("unknown_run", run=message.run))
-        return
+    known(state, message.run)
     permits.end(state, message.run, step, "by an operator's command", boot_id=message.boot_id)
     step.reply(event.request, operator.Done())
 

@@ -56,3 +56,11 @@ class Reason(NamedTuple):
 
 def because(code: str, **about: Any) -> Reason:
     return Reason(code, about)
+
+
+class NotDoneError(Exception):
+    """A rule does not carry out its request: the request is refused with the reason."""
+
+    def __init__(self, code: str | Reason, **about: Any) -> None:
+        super().__init__(code)
+        self.reason = because(code, **about) if isinstance(code, str) else code

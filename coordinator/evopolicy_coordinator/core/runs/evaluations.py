@@ -12,7 +12,7 @@ import msgspec
 from evopolicy_common.messages import operator
 from evopolicy_coordinator.core.contract import events
 from evopolicy_coordinator.core.contract.effects import ReadEvaluation
-from evopolicy_coordinator.core.contract.reasons import Reason, because
+from evopolicy_coordinator.core.contract.reasons import NotDoneError, Reason
 from evopolicy_coordinator.core.contract.records import EvaluationRow, evaluation_group
 from evopolicy_coordinator.core.leasing import groups, pins
 from evopolicy_coordinator.core.runs import templates, waits
@@ -34,8 +34,7 @@ def request(state: State, event: events.EvaluationRequested, step: Step) -> None
         )
         return
     if not row.cases or len(row.cases) != len(row.case_ids):
-        step.refuse(event.request, because("evaluation_without_cases"))
-        return
+        raise NotDoneError("evaluation_without_cases")
     row = msgspec.structs.replace(row, created_at=step.now, stimulus_id=step.stimulus_id)
     step.persist(row)
     evaluation = enter(state, row)
@@ -122,11 +121,8 @@ def polled(state: State, event: events.Requested[operator.EvaluationPoll], step:
         return
     group = state.groups.get(poll.target)
     if group is None:
-        step.refuse(
-            event.request,
-            because("unknown_evaluation", evaluation=message.evaluation),
-        )
-    elif group.done > message.cursor or not state.polls.wait(poll, message.wait_s, step.now):
+        raise NotDoneError("unknown_evaluation", evaluation=message.evaluation)
+    if group.done > message.cursor or not state.polls.wait(poll, message.wait_s, step.now):
         step.add(_page(state, poll, group, finished=False))
 
 

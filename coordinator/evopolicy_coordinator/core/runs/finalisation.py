@@ -17,7 +17,7 @@ Rules that this module owns:
 from __future__ import annotations
 
 from evopolicy_common.messages import gateway, operator
-from evopolicy_coordinator.core.agents import permits
+from evopolicy_coordinator.core.agents import permits, requests
 from evopolicy_coordinator.core.contract import events
 from evopolicy_coordinator.core.contract.effects import ReadFinished
 from evopolicy_coordinator.core.contract.reasons import because
@@ -109,10 +109,7 @@ def close(state: State, event: events.Requested[gateway.CloseRun], step: Step) -
     """The agent is gone: the run takes no more submits, and its hidden cases are played. A second
     close changes nothing."""
     message = event.message
-    run = state.runs.get(message.run)
-    if run is None and message.run not in state.capabilities:
-        step.refuse(event.request, because("unknown_run", run=message.run))
-        return
+    run = requests.known(state, message.run)
     permits.end(state, message.run, step, "its run was closed")
     permits.drop_asks(state, message.run, because("run_closed", run=message.run), step)
     if run is not None and run.state.phase == "open":
@@ -155,14 +152,10 @@ def advance(state: State, run: Run, step: Step) -> None:
 def cancel(state: State, event: events.Requested[operator.CancelRun], step: Step) -> None:
     """End a run at once on an operator's command; it is not scored. Also ends an evaluation of that name."""
     message = event.message
-    run = state.runs.get(message.run)
-    if run is None:
-        if evaluations.cancel(state, message.run, step) or message.run in state.capabilities:
-            step.reply(event.request, operator.Done())
-        else:
-            step.refuse(event.request, because("unknown_run", run=message.run))
-        return
-    _cancel(state, run, step)
+    if not evaluations.cancel(state, message.run, step):
+        run = requests.known(state, message.run)
+        if run is not None:
+            _cancel(state, run, step)
     step.reply(event.request, operator.Done())
 
 

@@ -6,9 +6,10 @@ from typing import Literal
 
 from evopolicy_common.messages import operator
 from evopolicy_common.records.aggregates import best_validated, mean
+from evopolicy_coordinator.core.agents import requests
 from evopolicy_coordinator.core.contract import events
 from evopolicy_coordinator.core.contract.effects import ReadFinished
-from evopolicy_coordinator.core.contract.reasons import Reason, because
+from evopolicy_coordinator.core.contract.reasons import Reason
 from evopolicy_coordinator.core.contract.records import (
     SubmitRow,
     random_group,
@@ -132,12 +133,9 @@ def result(
 def waited(state: State, event: events.Requested[operator.WaitRun], step: Step) -> None:
     """An operator waits for the end of a run."""
     message = event.message
-    run = state.runs.get(message.run)
+    run = requests.known(state, message.run)
     if run is None:
-        if message.run in state.capabilities:
-            step.add(ReadFinished(request=event.request, run=message.run))
-        else:
-            step.refuse(event.request, because("unknown_run", run=message.run))
+        step.add(ReadFinished(request=event.request, run=message.run))
         return
     poll = Poll(event.request, "run", run.id)
     if not state.polls.wait(poll, message.wait_s, step.now):

@@ -17,17 +17,16 @@ from evopolicy_common.messages.audit import Committed
 from evopolicy_common.messages.operator import Done, RunFinished
 from evopolicy_common.records import journal
 from evopolicy_coordinator.core.contract import events
-from evopolicy_coordinator.core.contract.reasons import Reason, because
+from evopolicy_coordinator.core.contract.reasons import NotDoneError
 from evopolicy_coordinator.core.contract.records import DocumentRow, JournalRow, RunRow, shared
 from evopolicy_coordinator.core.tables.state import State
 from evopolicy_coordinator.core.tables.step import Step
 
 
-def fault(state: State, row: RunRow) -> Reason | None:
-    """Why no run may be opened on these cases; None when one may."""
+def check_epoch(state: State, row: RunRow) -> None:
+    """Raises NotDoneError when no run may be opened on these cases."""
     if row.split_secret and row.epoch in state.revealed and not row.settings.replay_of:
-        return because("epoch_revealed", epoch=row.epoch)
-    return None
+        raise NotDoneError("epoch_revealed", epoch=row.epoch)
 
 
 def opened(state: State, row: RunRow, step: Step) -> RunRow:
@@ -74,8 +73,7 @@ def disclose(state: State, event: events.DisclosureRequested, step: Step) -> Non
     Revealed epochs stay so."""
     for run in state.runs.values():
         if run.row.epoch in event.epochs:
-            step.refuse(event.request, because("epoch_in_use", run=run.id))
-            return
+            raise NotDoneError("epoch_in_use", run=run.id)
     for epoch in event.epochs:
         if epoch not in state.revealed:
             state.revealed.add(epoch)

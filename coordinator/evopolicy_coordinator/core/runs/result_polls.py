@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from evopolicy_common.messages import gateway
+from evopolicy_coordinator.core.agents import requests
 from evopolicy_coordinator.core.contract import events
 from evopolicy_coordinator.core.contract.effects import ReadResults
-from evopolicy_coordinator.core.contract.reasons import because
+from evopolicy_coordinator.core.contract.reasons import NotDoneError
 from evopolicy_coordinator.core.contract.records import submit_group
 from evopolicy_coordinator.core.runs import waits
 from evopolicy_coordinator.core.runs.runs import held_s
@@ -18,25 +19,20 @@ from evopolicy_coordinator.core.tables.step import Step
 def results(state: State, event: events.Requested[gateway.ResultsRequest], step: Step) -> None:
     """A gateway polls for outcomes: answered at once, or when there are more than it has."""
     message = event.message
-    run = state.runs.get(message.run)
+    run = requests.known(state, message.run)
     if run is None:
-        if message.run in state.capabilities:
-            step.add(
-                ReadResults(
-                    request=event.request,
-                    run=message.run,
-                    submit_index=message.submit_index,
-                    cursor=max(0, message.cursor),
-                    upto=None,
-                )
+        step.add(
+            ReadResults(
+                request=event.request,
+                run=message.run,
+                submit_index=message.submit_index,
+                cursor=max(0, message.cursor),
+                upto=None,
             )
-        else:
-            step.refuse(event.request, because("unknown_run", run=message.run))
+        )
         return
     if not 0 <= message.submit_index < len(run.submits):
-        reason = because("unknown_submit", run=run.id, n=len(run.submits), submit=message.submit_index)
-        step.refuse(event.request, reason)
-        return
+        raise NotDoneError("unknown_submit", run=run.id, n=len(run.submits), submit=message.submit_index)
     target = submit_group(run.id, message.submit_index, "train")
     poll = Poll(event.request, "results", target, message.cursor)
     closed = run.submits[message.submit_index].status is not None

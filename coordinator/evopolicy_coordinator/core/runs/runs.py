@@ -16,7 +16,7 @@ from evopolicy_common.messages.gateway import CANCELLED
 from evopolicy_common.messages.status import RetriedJobs
 from evopolicy_coordinator.core.agents import requests
 from evopolicy_coordinator.core.contract import events
-from evopolicy_coordinator.core.contract.reasons import Reason, because
+from evopolicy_coordinator.core.contract.reasons import NotDoneError, Reason
 from evopolicy_coordinator.core.contract.records import RunRow, RunStateRow, shared, submit_group
 from evopolicy_coordinator.core.leasing import pins
 from evopolicy_coordinator.core.runs import journal, waits
@@ -33,12 +33,10 @@ def create(state: State, event: events.RunCreated, step: Step) -> None:
     if known is not None:
         step.reply(event.request, operator.RunCreated(run=known, capability=state.capabilities[known]))
         return
-    fault = _fault(row) or journal.fault(state, row)
-    if fault is None and row.run in state.capabilities:
-        fault = because("run_exists", run=row.run)
-    if fault is not None:
-        step.refuse(event.request, fault)
-        return
+    _check(row)
+    journal.check_epoch(state, row)
+    if row.run in state.capabilities:
+        raise NotDoneError("run_exists", run=row.run)
     row = msgspec.structs.replace(
         row,
         audit_share=state.settings.audit_share,
@@ -84,18 +82,17 @@ def forget(state: State, run: Run) -> None:
     pins.drop_flow(state, run.flow)
 
 
-def _fault(row: RunRow) -> Reason | None:
+def _check(row: RunRow) -> None:
     least, most = row.min_episodes_per_submit, row.max_episodes_per_submit
     if row.budget < 1:
-        return because("budget_below_one", budget=row.budget)
+        raise NotDoneError("budget_below_one", budget=row.budget)
     if not 1 <= least <= most:
-        return because("submit_bounds", least=least, most=most)
+        raise NotDoneError("submit_bounds", least=least, most=most)
     if least > row.budget:
-        return because("minimum_over_budget", least=least, budget=row.budget)
-    for name, cases in (("train", row.train), ("validation", row.validation), ("heldout", row.heldout)):
-        if not cases:
-            return because("no_cases", split=name)
-    return None
+        raise NotDoneError("minimum_over_budget", least=least, budget=row.budget)
+    for split in ("train", "validation", "heldout"):
+        if not getattr(row, split):
+            raise NotDoneError("no_cases", split=split)
 
 
 # ---- requests of gateways ----
@@ -103,18 +100,14 @@ def _fault(row: RunRow) -> Reason | None:
 
 def opened(state: State, event: events.Requested[gateway.OpenRun], step: Step) -> None:
     """Send a gateway the fixed parameters of its run; refused until a worker has offered the environment."""
-    run = requests.live(state, event.request, event.message.run, step)
-    if run is None:
-        return
+    run = requests.live(state, event.message.run)
     if run.flow.pin is None:
         pins.pin(state, run.flow, step)
     description = run.flow.description
     if description is None:
-        missing = waits.waits_for_workers(state, run.flow)
-        step.refuse(event.request, because("no_worker_yet", waits_for=missing))
-        return
-    if not event.message.asks_permit and requests.without_permit(state, event.request, run, step):
-        return
+        raise NotDoneError("no_worker_yet", waits_for=waits.waits_for_workers(state, run.flow))
+    if not event.message.asks_permit:
+        requests.demand_permit(state, run, step)
     current, waits_for = run_state(state, run, step.now)
     step.reply(
         event.request,
@@ -137,10 +130,8 @@ def state_requested(state: State, event: events.Requested[gateway.StateRequest],
     if last is not None:
         step.reply(event.request, gateway.StateReply(state=last))
         return
-    run = requests.live(state, event.request, event.message.run, step)
-    if run is not None:
-        current, waits_for = run_state(state, run, step.now)
-        step.reply(event.request, gateway.StateReply(state=current), waits_for)
+    current, waits_for = run_state(state, requests.live(state, event.message.run), step.now)
+    step.reply(event.request, gateway.StateReply(state=current), waits_for)
 
 
 def last_state(row: RunStateRow) -> gateway.RunState:

@@ -20,11 +20,11 @@ from evopolicy_common.messages.episode import NO_POLICY, PolicyFailure
 from evopolicy_common.messages.gateway import SubmitStatus
 from evopolicy_coordinator.core.agents import requests
 from evopolicy_coordinator.core.contract import events
-from evopolicy_coordinator.core.contract.reasons import because
+from evopolicy_coordinator.core.contract.reasons import NotDoneError
 from evopolicy_coordinator.core.contract.records import SubmitRow
 from evopolicy_coordinator.core.leasing import groups
 from evopolicy_coordinator.core.runs import result_polls, templates
-from evopolicy_coordinator.core.structures.ledger import refusal
+from evopolicy_coordinator.core.structures.ledger import check_request
 from evopolicy_coordinator.core.tables.model import JobGroup, Run
 from evopolicy_coordinator.core.tables.state import State
 from evopolicy_coordinator.core.tables.step import EpisodesDone, Step, SubmitEnded
@@ -37,41 +37,29 @@ def submit(state: State, event: events.Requested[gateway.Submit], step: Step) ->
     """Accept a submit, or refuse it for the first cause in the protocol's order; a known key
     gets the earlier answer."""
     message = event.message
-    run = requests.live(state, event.request, message.run, step)
-    if run is None:
-        return
+    run = requests.live(state, message.run)
     known = run.keys.get(message.key)
     if known is not None:
         _again(event, run.submits[known], step)
         return
     if run.state.phase != "open":
-        step.refuse(event.request, requests.over(state, run.id))
-        return
+        raise NotDoneError(requests.over(state, run.id))
     if run.open is not None:
-        step.refuse(event.request, because("busy", submit=run.open))
-        return
+        raise NotDoneError("busy", submit=run.open)
     if message.rejected is not None and run.row.settings.profile != "own":
         if len(run.submits) >= run.row.budget + MAX_REJECTED:
-            reason = because("too_many_rejected", n=len(run.submits))
-            step.refuse(event.request, reason)
-        elif not requests.without_permit(state, event.request, run, step):
-            _accept(state, run, event, step)
-        return
-    refused = refusal(
-        message.env_instances,
-        n_cases=len(run.row.train),
-        minimum=run.row.min_episodes_per_submit,
-        maximum=run.row.max_episodes_per_submit,
-        available=run.ledger.available,
-    )
-    if refused is not None:
-        step.refuse(event.request, refused)
-        return
-    if message.bundle is None and message.bundle_error is None:
-        step.refuse(event.request, because("no_bundle"))
-        return
-    if requests.without_permit(state, event.request, run, step):
-        return
+            raise NotDoneError("too_many_rejected", n=len(run.submits))
+    else:
+        check_request(
+            message.env_instances,
+            n_cases=len(run.row.train),
+            minimum=run.row.min_episodes_per_submit,
+            maximum=run.row.max_episodes_per_submit,
+            available=run.ledger.available,
+        )
+        if message.bundle is None and message.bundle_error is None:
+            raise NotDoneError("no_bundle")
+    requests.demand_permit(state, run, step)
     _accept(state, run, event, step)
 
 
@@ -79,9 +67,7 @@ def _again(event: events.Requested[gateway.Submit], row: SubmitRow, step: Step) 
     """Answer a known key as the first time if the request is the same; otherwise refuse it (KEY_CONFLICT)."""
     message = event.message
     if (message.env_instances, message.bundle) != (row.env_instances, row.bundle):
-        reason = because("key_used", key=message.key, submit=row.submit_index)
-        step.refuse(event.request, reason)
-        return
+        raise NotDoneError("key_used", key=message.key, submit=row.submit_index)
     step.reply(event.request, _accepted(row))
 
 

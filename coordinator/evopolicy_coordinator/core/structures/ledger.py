@@ -9,7 +9,7 @@ Rules that this module owns:
 
 from __future__ import annotations
 
-from evopolicy_coordinator.core.contract.reasons import Reason, because
+from evopolicy_coordinator.core.contract.reasons import NotDoneError
 from evopolicy_coordinator.core.structures import InvariantError
 
 
@@ -61,18 +61,17 @@ class Ledger:
         )
 
 
-def refusal(
+def check_request(
     env_instances: tuple[int, ...], *, n_cases: int, minimum: int, maximum: int, available: int
-) -> Reason | None:
-    """Returns why these train cases cannot be played, or None. Checks in the order that the protocol prescribes."""
+) -> None:
+    """Raises NotDoneError if these train cases cannot be played. Checks in the order that the protocol prescribes."""
     n = len(env_instances)
     for case_id in env_instances:
         if not 0 <= case_id < n_cases:
-            return because("unknown_case", case=case_id, last=n_cases - 1)
+            raise NotDoneError("unknown_case", case=case_id, last=n_cases - 1)
     if n < minimum:
-        return because("too_few", n=n, least=minimum)
+        raise NotDoneError("too_few", n=n, least=minimum)
     if n > maximum:
-        return because("too_many", n=n, most=maximum)
+        raise NotDoneError("too_many", n=n, most=maximum)
     if n > available:
-        return because("over_budget", n=n, remaining=available)
-    return None
+        raise NotDoneError("over_budget", n=n, remaining=available)

@@ -17,7 +17,7 @@ from __future__ import annotations
 from evopolicy_common.messages import operator
 from evopolicy_common.messages import worker as wire
 from evopolicy_coordinator.core.contract import events
-from evopolicy_coordinator.core.contract.reasons import because
+from evopolicy_coordinator.core.contract.reasons import NotDoneError
 from evopolicy_coordinator.core.contract.records import WorkerRow
 from evopolicy_coordinator.core.isolation import conflicts, kernels, occupancies
 from evopolicy_coordinator.core.leasing import fleet, leases, pins
@@ -30,17 +30,13 @@ from evopolicy_coordinator.core.workers import scheduler
 def registered(state: State, event: events.WorkerRegistered, step: Step) -> None:
     """A worker joins, or joins again under a new session."""
     message = event.message
-    if _refused_as_forger(state, message.worker, event.machine, event.request, step):
-        return
+    _refuse_forger(state, message.worker, event.machine)
     old = state.workers.get(message.worker)
     if old is not None and old.state != "lost" and old.machine != event.machine:
         # Otherwise one machine could play under another's name, and the other would be blamed.
-        step.refuse(event.request, because("name_taken", worker=message.worker))
-        return
+        raise NotDoneError("name_taken", worker=message.worker)
     if not fleet.has_room(state, event):
-        reason = because("no_room", n=fleet.MAX_WORKERS, size=fleet.MAX_DESCRIBED_BYTES)
-        step.refuse(event.request, reason)
-        return
+        raise NotDoneError("no_room", n=fleet.MAX_WORKERS, size=fleet.MAX_DESCRIBED_BYTES)
     if old is not None:
         fleet.drop_poll(state, old, step)
         fleet.answer_beat(state, old, (), step)
@@ -63,48 +59,39 @@ def registered(state: State, event: events.WorkerRegistered, step: Step) -> None
     pins.pin_waiting(state, worker, step)
 
 
-def _refused_as_forger(state: State, name: str, machine: str, request: events.RequestId, step: Step) -> bool:
+def _refuse_forger(state: State, name: str, machine: str) -> None:
     forger = name if name in state.quarantined else state.quarantined_machines.get(machine)
-    if forger is None:
-        return False
-    reason = because("forger", worker=name, why=state.quarantined[forger], forger=forger)
-    step.refuse(request, reason)
-    return True
+    if forger is not None:
+        raise NotDoneError("forger", worker=name, why=state.quarantined[forger], forger=forger)
 
 
 def worker_of(
     state: State, event: events.Requested[wire.LeaseRequest | wire.Heartbeat | wire.ReportResults], step: Step
-) -> Worker | None:
-    """Returns the worker that sent the request; None, and the request is refused, when its session is unknown
-    or it is quarantined."""
+) -> Worker:
+    """Returns the worker that sent the request. Raises NotDoneError when its session is unknown or it is
+    quarantined."""
     message = event.message
     known = state.workers.get(message.worker)
-    if _refused_as_forger(state, message.worker, known.machine if known else "", event.request, step):
-        return None
+    _refuse_forger(state, message.worker, known.machine if known else "")
     was_lost = known is not None and known.state == "lost"
     worker = fleet.of_session(state, message.worker, message.session, step.now)
     if worker is None:
-        step.refuse(event.request, because("unknown_session", worker=message.worker))
-    else:
-        state.timers.arm_once(("worker", worker.name), step.now + state.settings.lease_ttl_s)
-        if was_lost:
-            pins.pin_waiting(state, worker, step)
+        raise NotDoneError("unknown_session", worker=message.worker)
+    state.timers.arm_once(("worker", worker.name), step.now + state.settings.lease_ttl_s)
+    if was_lost:
+        pins.pin_waiting(state, worker, step)
     return worker
 
 
 def lease_requested(state: State, event: events.Requested[wire.LeaseRequest], step: Step) -> None:
     """A worker polls for leases."""
-    worker = worker_of(state, event, step)
-    if worker is not None:
-        scheduler.poll(state, worker, event, step)
+    scheduler.poll(state, worker_of(state, event, step), event, step)
 
 
 def heartbeat(state: State, event: events.Requested[wire.Heartbeat], step: Step) -> None:
     """Renew the leases that a worker names, and reply with those to stop."""
     message = event.message
     worker = worker_of(state, event, step)
-    if worker is None:
-        return
     fleet.answer_beat(state, worker, (), step)
     stop = leases.hear(state, worker, message.held, step, settled=message.settled)
     worker.beat = event.request
@@ -117,8 +104,6 @@ def heartbeat(state: State, event: events.Requested[wire.Heartbeat], step: Step)
 def results_reported(state: State, event: events.Requested[wire.ReportResults], step: Step) -> None:
     """Take results, and answer once they are durable."""
     worker = worker_of(state, event, step)
-    if worker is None:
-        return
     for result in event.message.results:
         step.tell(ResultsPersisted(worker, result))
     step.reply_last(event.request, wire.ResultsReported(n=len(event.message.results)))
@@ -136,9 +121,7 @@ def worker_state(state: State, event: events.Requested[operator.SetWorker], step
     """Drain, pause or reactivate a worker; durable, also for one that is not connected."""
     message = event.message
     if message.state != "active" and message.worker in state.quarantined:
-        reason = because("quarantined", worker=message.worker, why=state.quarantined[message.worker])
-        step.refuse(event.request, reason)
-        return
+        raise NotDoneError("quarantined", worker=message.worker, why=state.quarantined[message.worker])
     step.persist(WorkerRow(worker=message.worker, state=message.state))
     worker = state.workers.get(message.worker)
     if worker is not None and message.state != "active":
@@ -157,30 +140,28 @@ def repinned(state: State, event: events.Requested[operator.RepinRun], step: Ste
     """Pin an unfinished run to another class of workers on an operator's command."""
     message = event.message
     run = state.runs.get(message.run)
-    able = [each for each in state.profiles.values() if run is not None and each.offers(run.flow)]
+    if run is None:
+        raise NotDoneError("no_unfinished_run", run=message.run)
+    able = [each for each in state.profiles.values() if each.offers(run.flow)]
     # Accepts the environment's class, and the whole worker's class, which the list of workers shows.
     offered = {_class_of_worker(state, each): each for each in able}
-    offered |= {each.classes[run.flow.env]: each for each in able if run is not None}
-    if run is None:
-        step.refuse(event.request, because("no_unfinished_run", run=message.run))
-    elif message.fingerprint_class not in offered:
-        reason = because("unknown_class", name=message.fingerprint_class, offered=tuple(offered))
-        step.refuse(event.request, reason)
-    else:
-        profile = offered[message.fingerprint_class]
-        name = profile.classes[run.flow.env]
-        text = f"{run.state.fingerprint_class} → {name}: {message.reason}"
-        step.change_run(
-            run,
-            fingerprint_class=name,
-            overrides=(*run.state.overrides, text),
-            description=run.state.description or profile.descriptions[run.flow.env],
-            fingerprint=run.state.fingerprint or profile.fingerprints[run.flow.env],
-        )
-        run.flow.description = run.state.description
-        pins.place(state, run.flow, name, step)
-        step.log("warning", "run_repinned", run=run.id, override=text)
-        step.reply(event.request, operator.Done())
+    offered |= {each.classes[run.flow.env]: each for each in able}
+    if message.fingerprint_class not in offered:
+        raise NotDoneError("unknown_class", name=message.fingerprint_class, offered=tuple(offered))
+    profile = offered[message.fingerprint_class]
+    name = profile.classes[run.flow.env]
+    text = f"{run.state.fingerprint_class} → {name}: {message.reason}"
+    step.change_run(
+        run,
+        fingerprint_class=name,
+        overrides=(*run.state.overrides, text),
+        description=run.state.description or profile.descriptions[run.flow.env],
+        fingerprint=run.state.fingerprint or profile.fingerprints[run.flow.env],
+    )
+    run.flow.description = run.state.description
+    pins.place(state, run.flow, name, step)
+    step.log("warning", "run_repinned", run=run.id, override=text)
+    step.reply(event.request, operator.Done())
 
 
 def _class_of_worker(state: State, profile: Profile) -> str:

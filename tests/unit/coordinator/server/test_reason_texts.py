@@ -26,7 +26,8 @@ def given() -> list[tuple[str, set[str]]]:
     found = []
     for path in sorted(CORE.rglob("*.py")):
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-            if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "because":
+            name = node.func.id if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) else ""
+            if isinstance(node, ast.Call) and name in ("because", "NotDoneError"):
                 about = {keyword.arg or "" for keyword in node.keywords}
                 found += [
                     (each.value, about) for each in ast.walk(node.args[0]) if isinstance(each, ast.Constant)

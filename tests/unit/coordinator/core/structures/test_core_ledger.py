@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given
 from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
 
-from evopolicy_coordinator.core.contract.reasons import REFUSALS
+from evopolicy_coordinator.core.contract.reasons import REFUSALS, NotDoneError
 from evopolicy_coordinator.core.structures import InvariantError
-from evopolicy_coordinator.core.structures.ledger import Ledger, refusal
+from evopolicy_coordinator.core.structures.ledger import Ledger, check_request
 
 GRANTED = 40
 
@@ -62,7 +62,11 @@ TestLedgerAgainstModel = LedgerAgainstModel.TestCase
 
 @given(ids=st.lists(st.integers(-3, 12), max_size=12), available=st.integers(0, 12))
 def test_a_request_is_refused_exactly_when_it_breaks_a_bound(ids: list[int], available: int) -> None:
-    refused = refusal(tuple(ids), n_cases=10, minimum=2, maximum=8, available=available)
+    refused = None
+    try:
+        check_request(tuple(ids), n_cases=10, minimum=2, maximum=8, available=available)
+    except NotDoneError as error:
+        refused = error.reason
     inside = all(0 <= case_id < 10 for case_id in ids)
     fits = 2 <= len(ids) <= min(8, available)
     assert (refused is None) == (inside and fits)
