@@ -31,7 +31,7 @@ from evopolicy_coordinator.server.reason_texts import words as reason_words
 from evopolicy_coordinator.web.content import cluster as polling
 from evopolicy_coordinator.web.content import rendering
 from evopolicy_coordinator.web.content.feeds import LEAST_PAUSE_S
-from evopolicy_coordinator.web.content.tables import Words
+from evopolicy_coordinator.web.content.rendering import Words
 
 FIRST_PAGE_BYTES, FIRST_PAGE_S, CORE_SHARE = 100_000, 1.0, 0.02
 

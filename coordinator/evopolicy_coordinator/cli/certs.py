@@ -190,15 +190,15 @@ def _certificate(root: Path) -> certs.Described:
 
 def _own_hosts() -> list[str]:
     """This machine's address on the way out, if it has one, and its names."""
-    found = []
+    hosts = []
     with contextlib.suppress(OSError), socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         probe.connect(("192.0.2.1", 9))  # on a datagram socket it sends nothing, and only selects the route
-        found.append(str(probe.getsockname()[0]))
+        hosts.append(str(probe.getsockname()[0]))
     for name in (socket.getfqdn(), socket.gethostname()):
         with contextlib.suppress(ConfigError):
             certs.check_hosts([name])
-            found.append(name)
-    return found
+            hosts.append(name)
+    return hosts
 
 
 def _state_option(state: Path | None) -> str:

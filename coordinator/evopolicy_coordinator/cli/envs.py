@@ -54,32 +54,32 @@ def envs(
         return
     offered, later, failed = asking(connect, file, OperatorClient.environments)
     patterns = [*(only or ()), *([show] if show else ())]
-    found = [each for each in offered if _wanted(each.description.env, patterns)]
+    wanted = [each for each in offered if _wanted(each.description.env, patterns)]
     later = {env: workers for env, workers in later.items() if _wanted(env, patterns)}
     failed = {env: reasons for env, reasons in failed.items() if _wanted(env, patterns)}
     if as_json:
         say_json(
             [
-                *found,
+                *wanted,
                 *({"env": env, "workers": workers, "described": False} for env, workers in later.items()),
                 *({"env": env, "failed": reasons} for env, reasons in failed.items()),
             ]
         )
         return
     if show is not None:
-        _show(show, found, later, failed)
+        _show(show, wanted, later, failed)
         return
-    shown = listing(found, _COLUMNS, right=("steps", "µs a step"), whole=("environment", "definition"))
+    shown = listing(wanted, _COLUMNS, right=("steps", "µs a step"), whole=("environment", "definition"))
     for env, workers in later.items():
         entry = catalogue.entry(env)
         steps, names = f"{entry.max_episode_steps:,}", ", ".join(workers)
         shown.add_row(env, _family(entry.family), "on first use", "", steps, "", "", "", names)
-    if found or later:
+    if wanted or later:
         terminal().print(shown)
     elif not failed:
         say("no connected worker offers such an environment")
     say_lines(_failures(failed))
-    if found or later or failed:
+    if wanted or later or failed:
         return
     lacking = {env: installs.advice(env) for env in catalogue.entries() if only and _wanted(env, only)}
     for line in dict.fromkeys(filter(None, lacking.values())):
@@ -122,7 +122,7 @@ def _failures(failed: Mapping[str, Mapping[str, str]]) -> Iterator[str]:
 
 def _show(
     env: str,
-    found: list[OfferedEnvironment],
+    wanted: list[OfferedEnvironment],
     later: Mapping[str, Collection[str]],
     failed: Mapping[str, Mapping[str, str]],
 ) -> None:
@@ -131,14 +131,14 @@ def _show(
             f"{env} is described when its first run waits for it, by {', '.join(later[env])}; to see it before, start a"
             " worker that offers it alone"
         )
-    if not found:
+    if not wanted:
         if failed:
             raise ConfigError("; ".join(_failures(failed)))
         advice = installs.advice(env)
         raise ConfigError(
             f"no connected worker offers {env}" + (f"; {advice}" if advice else catalogue.near(env))
         )
-    for each in found:
+    for each in wanted:
         fields = msgspec.to_builtins(each.description)
         text = fields.pop("task_text")
         say(f"{each.description.env}@{each.digest}: {each.accepted}, offered by {', '.join(each.workers)}")

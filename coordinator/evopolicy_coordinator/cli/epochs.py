@@ -40,18 +40,18 @@ def list_(state: State = None, as_json: Json = False) -> None:
     """List the epochs in the journal, with the number of runs and whether their cases are public."""
     root = state or default_state_dir()
     entries = _journal(root)
-    found = journal.epochs(map(journal.read_entry, entries))
+    epochs = journal.epochs(map(journal.read_entry, entries))
     current = _current(root)
     head = ([journal.EMPTY_HEAD, *journal.heads(entries)])[-1]
     if as_json:
-        say_json({"current": current, "entries": len(entries), "head": head, "epochs": found})
+        say_json({"current": current, "entries": len(entries), "head": head, "epochs": epochs})
         return
     shown = table("epoch", "runs", "finished", "first run", "cases")
-    for each in found:
+    for each in epochs:
         cases = "secret" if each.revealed_at is None else f"public since {_when(each.revealed_at)}"
         name = f"{each.epoch} (current)" if each.epoch == current else each.epoch
         shown.add_row(name, str(each.opened), str(each.ended), _when(each.began_at), cases)
-    if current and all(each.epoch != current for each in found):
+    if current and all(each.epoch != current for each in epochs):
         shown.add_row(f"{current} (current)", "0", "0", "none yet", "secret")
     terminal().print(shown)
     say(f"journal: {len(entries)} {'entry' if len(entries) == 1 else 'entries'}, head {head}")

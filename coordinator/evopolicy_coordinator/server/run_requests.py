@@ -93,8 +93,8 @@ class RunRequests:
             of = self._reader.replayed(message.settings.replay_of)
             return RunCreated(**about, row=self._run(message) if of is None else _replay(message, of))
         if isinstance(message, operator.Rescore):
-            found = self._reader.finished_with_result(message.run)
-            return EvaluationRequested(**about, row=self.rescore(message, *found))
+            of_run = self._reader.finished_with_result(message.run)
+            return EvaluationRequested(**about, row=self.rescore(message, *of_run))
         return EvaluationRequested(**about, row=self._evaluation(message))
 
     def _run(self, m: operator.CreateRun) -> RunRow:

@@ -119,8 +119,8 @@ class Access:
 
     def _matching(self, given: str, right: Mapping[Role, str]) -> Role | None:
         # All are compared, so that the time tells nothing.
-        found = [role for role, each in right.items() if hmac.compare_digest(given.encode(), each.encode())]
-        return found[-1] if found else None
+        roles = [role for role, each in right.items() if hmac.compare_digest(given.encode(), each.encode())]
+        return roles[-1] if roles else None
 
     def is_own_host(self, host: str) -> bool:
         """Whether `Host` names this server: an address, which cannot be rebound, or one of its names."""

@@ -15,7 +15,7 @@ from collections.abc import AsyncIterator, Callable, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
-from urllib.parse import parse_qsl, urlencode
+from urllib.parse import parse_qsl
 
 from prometheus_client import CollectorRegistry, Gauge, ProcessCollector, generate_latest
 from starlette.applications import Starlette
@@ -37,11 +37,11 @@ from evopolicy_coordinator.web.content import rendering
 from evopolicy_coordinator.web.content.cluster import Cluster, set_within
 from evopolicy_coordinator.web.content.confined import Confined, NotThereError
 from evopolicy_coordinator.web.content.feeds import Feeds
+from evopolicy_coordinator.web.content.rendering import Words, ident
 from evopolicy_coordinator.web.content.run_detail import IMAGES, Detail
 from evopolicy_coordinator.web.content.run_folders import Reader, RunFacts, Runs
-from evopolicy_coordinator.web.content.tables import Words, ident
 from evopolicy_coordinator.web.views.cluster import cluster_view
-from evopolicy_coordinator.web.views.run import episode_values, run_view, submit_values
+from evopolicy_coordinator.web.views.run import episode_values, file_link, run_view, submit_values
 from evopolicy_coordinator.web.views.sweeps import sweeps_view
 
 _FORM_WAIT_S = 10.0
@@ -223,7 +223,7 @@ class Site:
         run, replays = self._run(request), []
         if run.path is not None and self.runs.may_show(run):  # recordings of hidden episodes
             names = Detail(run.path).replays()
-            replays = [(name, _file_link(run, f"replays/{name}/video.mp4")) for name in names]
+            replays = [(name, file_link(run, f"replays/{name}/video.mp4")) for name in names]
         title = f"{run.entry} on {run.env}"
         return await self.live_page(request, f"run/{run.key}", "run.html.j2", title, run=run, replays=replays)
 
@@ -248,7 +248,7 @@ class Site:
     async def episode_page(self, request: Request) -> Response:
         await self.refresh()
         run, index, episode = self._run(request), request.path_params["index"], request.path_params["episode"]
-        values = await asyncio.to_thread(_episode, run, index, episode)
+        values = await asyncio.to_thread(episode_values, run, index, episode)
         title = f"Episode {episode} of submit {index}"
         return self._page(
             request, "episode.html.j2", title=title, run=run, index=index, episode=episode, **values
@@ -412,28 +412,6 @@ async def _form(request: Request) -> dict[str, str]:
     except TimeoutError:
         return {}
     return dict(parse_qsl(data.decode("utf-8", "replace")))
-
-
-def _file_link(run: RunFacts, path: str) -> str:
-    return f"/run/{run.key}/file?{urlencode({'path': path})}"
-
-
-def _episode(run: RunFacts, index: int, episode: int) -> dict[str, Any]:
-    if run.path is None:
-        raise NotThereError(run.key)
-    detail = Detail(run.path)
-    place, names = detail.episode_files(index, episode)
-    beside = detail.episodes(index)
-    texts = {name: detail.text(f"{place}/{name}") for name in ("error.txt", "stdout.txt", "stderr.txt")}
-    links = {name: _file_link(run, f"{place}/{name}") for name in names}
-    return {
-        **episode_values(detail, place),
-        "previous": episode - 1 if episode - 1 in beside else None,
-        "next": episode + 1 if episode + 1 in beside else None,
-        "texts": [(name, text) for name, text in texts.items() if text],
-        "images": [(name, link) for name, link in links.items() if Path(name).suffix.lower() in IMAGES],
-        "videos": [link for name, link in links.items() if name.endswith(".mp4")],
-    }
 
 
 def _file(request: Request, files: Confined, path: str, types: Mapping[str, str], policy: str) -> Response:

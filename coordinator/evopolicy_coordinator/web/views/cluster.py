@@ -17,9 +17,8 @@ from evopolicy_common.terminal import duration
 from evopolicy_coordinator.web.content.charts import Line, chart
 from evopolicy_coordinator.web.content.cluster import Cluster
 from evopolicy_coordinator.web.content.remarks import audits, remarks
-from evopolicy_coordinator.web.content.rendering import View, part, short
+from evopolicy_coordinator.web.content.rendering import PAGE_ROWS, View, Words, ident, paged, part, short
 from evopolicy_coordinator.web.content.run_folders import RunFacts, Runs
-from evopolicy_coordinator.web.content.tables import PAGE_ROWS, Words, ident, paged
 from evopolicy_results.html import notice
 from evopolicy_results.reading.environments import title_of
 

@@ -5,7 +5,9 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
 from typing import Any
+from urllib.parse import urlencode
 
 from markupsafe import Markup
 
@@ -16,10 +18,9 @@ from evopolicy_common.records.summary import utc_text
 from evopolicy_common.terminal import counted, duration, number
 from evopolicy_coordinator.web.content.charts import Line, chart
 from evopolicy_coordinator.web.content.confined import NotThereError
-from evopolicy_coordinator.web.content.rendering import View, part, short, state_words
-from evopolicy_coordinator.web.content.run_detail import MAX_WORDS, CodeFile, Detail, Happened
+from evopolicy_coordinator.web.content.rendering import View, Words, ident, part, short, state_words
+from evopolicy_coordinator.web.content.run_detail import IMAGES, MAX_WORDS, CodeFile, Detail, Happened
 from evopolicy_coordinator.web.content.run_folders import Reader, RunFacts, Runs, Submit
-from evopolicy_coordinator.web.content.tables import Words, ident
 from evopolicy_results.behaviour.trace import diff
 from evopolicy_results.html import notice
 from evopolicy_results.reading.environments import title_of
@@ -207,8 +208,29 @@ def _diffs(before: Iterable[CodeFile], after: Iterable[CodeFile]) -> list[dict[s
     ]
 
 
-def episode_values(detail: Detail, place: str) -> dict[str, Any]:
-    """Charts of the episode in a folder."""
+def file_link(run: RunFacts, path: str) -> str:
+    """The address of a file of a run."""
+    return f"/run/{run.key}/file?{urlencode({'path': path})}"
+
+
+def episode_values(run: RunFacts, index: int, episode: int) -> dict[str, Any]:
+    """The parts of one episode's page. NotThereError for an episode without a folder here."""
+    if run.path is None:
+        raise NotThereError(run.key)
+    detail = Detail(run.path)
+    place, names = detail.episode_files(index, episode)
+    beside = detail.episodes(index)
     steps, lines, note = detail.played(place)
     charts = [(title, chart(f"{title} over steps", "step", series)) for title, series in lines.items()]
-    return {"charts": [(title, Markup(svg)) for title, svg in charts if svg], "note": note, "steps": steps}
+    texts = {name: detail.text(f"{place}/{name}") for name in ("error.txt", "stdout.txt", "stderr.txt")}
+    links = {name: file_link(run, f"{place}/{name}") for name in names}
+    return {
+        "charts": [(title, Markup(svg)) for title, svg in charts if svg],
+        "note": note,
+        "steps": steps,
+        "previous": episode - 1 if episode - 1 in beside else None,
+        "next": episode + 1 if episode + 1 in beside else None,
+        "texts": [(name, text) for name, text in texts.items() if text],
+        "images": [(name, link) for name, link in links.items() if Path(name).suffix.lower() in IMAGES],
+        "videos": [link for name, link in links.items() if name.endswith(".mp4")],
+    }
