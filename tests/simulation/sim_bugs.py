@@ -121,7 +121,7 @@ BUGS = (
     Bug(
         "forget the hidden jobs that train jobs wait behind",
         leases,
-        "_check_again",
+        "list_hidden",
         "if lane.n_ready[TRAIN]:",
         "if False:",
         seed=25,

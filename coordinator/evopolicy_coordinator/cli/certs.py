@@ -181,7 +181,6 @@ def first_endpoint(root: Path) -> str:
 
 
 def _certificate(root: Path) -> certs.Described:
-    """The coordinator's."""
     own = machines.coordinators_certificate(root)
     if own is None:
         raise ConfigError(f"{root} has no certificate authority yet: evopolicy-coordinator certs init")

@@ -87,7 +87,6 @@ def make(
 def _plan(
     envs: list[str], root: Path, seed: int | None, train: int | None, valid: int | None, heldout: int | None
 ) -> dict[Path, bytes]:
-    """The files to be, by path."""
     secret = secrets.token_bytes(splits.SECRET_BYTES) if seed is None else splits.public_secret(seed)
     planned: dict[Path, bytes] = {}
     for env in envs:
@@ -132,7 +131,6 @@ def check(
 
 
 def _report(folder: Path) -> dict[str, Any]:
-    """The report on one environment's folder."""
     loaded, findings = splits.load(folder)
     if loaded is None:
         return {"folder": str(folder), "env": None, "findings": findings}

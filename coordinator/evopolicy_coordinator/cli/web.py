@@ -162,7 +162,6 @@ def _check_certificate(certificate: Path, key: Path) -> None:
 
 
 async def _is_reachable(own: Credentials) -> bool:
-    """Whether this machine's coordinator answers."""
     try:
         async with asyncio.timeout(_REACH_S), transport.connect(own) as link:
             await OperatorClient(link).status()

@@ -68,7 +68,6 @@ def status(state: State, now: float, words: Words) -> StatusReply:
 
 
 def _queue(state: State, waits: dict[JobGroup, Reason], words: Words) -> tuple[QueuedJobs, ...]:
-    """Returns the unfinished jobs by priority and environment."""
     grouped: dict[tuple[int, str], list[JobGroup]] = {}
     for group in state.groups.values():
         if group.jobs:

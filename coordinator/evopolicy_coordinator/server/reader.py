@@ -346,7 +346,6 @@ _READS: dict[type, Callable[[ServiceReader, Any], Message]] = {
 
 
 def _after(rows: Sequence[OutcomeRow | JournalRow], cursor: int) -> int:
-    """The cursor of the next page."""
     return rows[-1].seq + 1 if rows else cursor
 
 

@@ -182,7 +182,6 @@ class RequestParser:
         return replace(m, results=results)
 
     def _unpacked(self, result: worker.JobResult) -> worker.JobResult:
-        """Returns the result with its outcomes unpacked when they came as a blob."""
         if result.packed is None:
             return result
         # Checked before they are read: a blob may have a gigabyte.

@@ -138,7 +138,6 @@ class Site:
             self._scan_s = self._scanned_at - began
 
     async def _tell(self) -> None:
-        """Updates the open pages."""
         while True:
             await set_within(self._moved, _SCAN_S)
             self._moved.clear()

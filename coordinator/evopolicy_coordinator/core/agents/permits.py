@@ -101,7 +101,6 @@ def restore(state: State, row: PermitRow, case_set: CaseSet) -> None:
 
 
 def _withdraw(state: State, run: str, kernel: Kernel, case_set: CaseSet) -> Ask | None:
-    """Remove a permit request."""
     ask = take(kernel.asks, case_set, run)
     state.asks.pop((run, kernel.boot_id), None)
     if ask is not None:

@@ -106,15 +106,11 @@ def list_hidden(state: State, lease: Lease, worker: Worker, step: Step) -> None:
     if lease.job.priority != TRAIN:
         lease.hidden_in = worker.profile.hidden[lease.job.priority]
         lease.hidden_in[lease] = None
-        _check_again(state, worker, step)
-
-
-def _check_again(state: State, worker: Worker, step: Step) -> None:
-    """Check the worker's lanes again soon: train jobs that wait already (they avoided it, or the hidden job was adopted
-    from its heartbeat) may stop its hidden job without any further event."""
-    for lane in worker.profile.busy:
-        if lane.n_ready[TRAIN]:
-            state.timers.arm_once(("lane", lane.key), step.now + queue.RECHECK_S)
+        # Train jobs that wait already (they avoided the worker, or the hidden job was adopted from its heartbeat) may
+        # stop it without any further event.
+        for lane in worker.profile.busy:
+            if lane.n_ready[TRAIN]:
+                state.timers.arm_once(("lane", lane.key), step.now + queue.RECHECK_S)
 
 
 def let_go(state: State, group: JobGroup, now: float) -> None:

@@ -168,7 +168,11 @@ def _place_suspects(state: State, step: Step) -> None:
             if job.priority == TRAIN:
                 avoided = job.avoid if step.now < job.avoid_until and lane.workers() > 1 else None
                 preemption.clear(state, lane, job.group.flow.case_set, avoided, step)
-            _try_parked(state, lane, step, TRIES_MAX)
+            for profile in lane.profiles:
+                for name in list(islice(profile.parked, TRIES_MAX)):
+                    worker = state.workers[name]
+                    if not _serve(state, worker, step):
+                        _to_the_back(state, worker, step)
 
 
 def _tell(state: State, name: str, stops: tuple[str, ...], step: Step) -> None:
@@ -211,14 +215,6 @@ def _feed(state: State, lane: Lane, step: Step) -> None:
             _to_the_back(state, worker, step)
     if any(lane.n_ready):
         state.timers.arm_once(("lane", lane.key), step.now + queue.RECHECK_S)
-
-
-def _try_parked(state: State, lane: Lane, step: Step, tries: int) -> None:
-    for profile in lane.profiles:
-        for name in list(islice(profile.parked, tries)):
-            worker = state.workers[name]
-            if not _serve(state, worker, step):
-                _to_the_back(state, worker, step)
 
 
 def _to_the_back(state: State, worker: Worker, step: Step) -> None:

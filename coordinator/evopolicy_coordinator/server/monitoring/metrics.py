@@ -180,7 +180,6 @@ def _gauge(name: str, text: str, value: float) -> Metric:
 
 
 def _gauges(name: str, text: str, labels: tuple[str, ...], values: Mapping[Any, float]) -> Metric:
-    """A gauge with the value of each combination of labels."""
     made = GaugeMetricFamily(name, text, labels=labels)
     for each, value in values.items():
         made.add_metric(each, value)

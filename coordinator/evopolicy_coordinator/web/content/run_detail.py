@@ -337,7 +337,6 @@ def _parts(value: dict[str, Any]) -> Iterator[tuple[str, dict[str, Any]]]:
 
 
 def _told(form: str, value: dict[str, Any]) -> Iterator[tuple[str, str, str]]:
-    """Kind, title and text of each entry."""
     for kind, title, fields in _FORMS.get(form, ()):
         text = next((value[name] for name in fields.split() if value.get(name)), "")
         yield kind, title.format(name=value.get("name", "tool")), _plain(text)
