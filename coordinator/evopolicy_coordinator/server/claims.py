@@ -10,14 +10,14 @@ Rules:
 from __future__ import annotations
 
 import asyncio
-import math
 from typing import Any
 
 import msgspec
 
-from evopolicy_common.errors import DECODE_ERRORS, DamagedStoreError, RefusedError
+from evopolicy_common.errors import DECODE_ERRORS, DamagedStoreError
 from evopolicy_common.messages.operator import Claim, ClaimState
 from evopolicy_common.refusals import Refusal
+from evopolicy_coordinator.server.request_checks import require
 from evopolicy_coordinator.storage.store import Store, unreadable
 from evopolicy_coordinator.storage.writer import Writer
 
@@ -35,6 +35,7 @@ class ClaimRow(msgspec.Struct, frozen=True, kw_only=True):
     result: dict[str, Any] | None = None
 
 
+_FREE = ClaimRow(holder="")
 _rows = msgspec.msgpack.Decoder(ClaimRow)
 
 
@@ -55,24 +56,19 @@ class Claims:
         """
         _check(message)
         async with self._one_at_a_time:
-            rows = await self._loaded(now)
-            key = (message.suite, message.name)
-            row = rows.get(key)
-            if row is not None and row.result is not None:
+            rows, key = await self._loaded(now), (message.suite, message.name)
+            row = rows.get(key, _FREE)
+            held = row.holder not in ("", message.holder) and self._until.get(key, 0.0) > now
+            if held or row.result is not None:
                 return ClaimState(granted=False, holder=row.holder, run=row.run, result=row.result)
-            free = row is None or not row.holder or self._until.get(key, 0.0) <= now
-            if row is not None and row.holder != message.holder and not free:
-                return ClaimState(granted=False, holder=row.holder, run=row.run)
-            previous = row.holder if row is not None and row.holder != message.holder else ""
             given_back = message.ttl_s <= 0.0 and message.result is None
-            last_run = "" if row is None else row.run
             new = ClaimRow(
                 holder="" if given_back else message.holder,
-                run=message.run or last_run,
+                run=message.run or row.run,
                 ttl_s=message.ttl_s,
                 result=message.result,
             )
-            if new != row:
+            if new != rows.get(key):
                 data = msgspec.msgpack.encode(new)
                 await self._writer.call(lambda store: store.write_claim(*key, data))
                 rows[key] = new
@@ -80,8 +76,8 @@ class Claims:
             return ClaimState(
                 granted=not given_back,
                 holder=new.holder,
-                run=last_run,
-                previous=previous,
+                run=row.run,
+                previous=row.holder if row.holder != message.holder else "",
                 result=message.result,
             )
 
@@ -103,10 +99,10 @@ def _decoded(suite: str, name: str, data: bytes) -> ClaimRow:
 
 
 def _check(message: Claim) -> None:
-    for what in ("suite", "name", "holder"):
-        if not 1 <= len(getattr(message, what)) <= _MAX_NAME:
-            raise RefusedError(Refusal.BAD_MESSAGE, f"a claim's {what} has 1 to {_MAX_NAME} characters")
-    if not (math.isfinite(message.ttl_s) and 0.0 <= message.ttl_s <= MAX_TTL_S):
-        raise RefusedError(Refusal.BAD_MESSAGE, f"ttl_s {message.ttl_s}: 0 to {MAX_TTL_S:g} seconds")
-    if message.result is not None and len(msgspec.msgpack.encode(message.result)) > _MAX_RESULT_BYTES:
-        raise RefusedError(Refusal.BAD_MESSAGE, "a claim's result is larger than 64 KiB")
+    for name in ("suite", "name", "holder"):
+        text = f"a claim's {name} has 1 to {_MAX_NAME} characters"
+        require(1 <= len(getattr(message, name)) <= _MAX_NAME, Refusal.BAD_MESSAGE, text)
+    text = f"ttl_s {message.ttl_s}: 0 to {MAX_TTL_S:g} seconds"
+    require(0.0 <= message.ttl_s <= MAX_TTL_S, Refusal.BAD_MESSAGE, text)
+    size = len(msgspec.msgpack.encode(message.result))
+    require(size <= _MAX_RESULT_BYTES, Refusal.BAD_MESSAGE, "a claim's result is larger than 64 KiB")

@@ -45,7 +45,6 @@ class Sample(msgspec.Struct, frozen=True, kw_only=True):
     running: int
     queued: int
     slots: int
-    workers: int
 
 
 class Cluster:
@@ -130,15 +129,13 @@ class Cluster:
             self.retries.popitem(last=False)
         now = time.time()
         if not self.history or now - self.history[-1].at >= _SAMPLE_S:
-            active = [worker for worker in status.workers if worker.state == "active"]
             self.history.append(
                 Sample(
                     at=now,
                     episodes_per_s=status.episodes_per_s,
                     running=sum(run.running for run in status.runs),
                     queued=sum(run.queued for run in status.runs),
-                    slots=sum(worker.slots for worker in active),
-                    workers=len(active),
+                    slots=sum(worker.slots for worker in status.workers if worker.state == "active"),
                 )
             )
         self._changed()
