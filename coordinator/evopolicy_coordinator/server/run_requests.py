@@ -39,7 +39,7 @@ from evopolicy_coordinator.core.contract.events import (
     RunCreated,
 )
 from evopolicy_coordinator.core.contract.reasons import because
-from evopolicy_coordinator.core.contract.records import EvaluationRow, RunRow
+from evopolicy_coordinator.core.contract.records import EvaluationRow, RunRow, shared
 from evopolicy_coordinator.core.runs.templates import RANDOM
 from evopolicy_coordinator.server.reader import ServiceReader
 from evopolicy_coordinator.server.reason_texts import words
@@ -163,21 +163,14 @@ class RunRequests:
         if wrong is not None or not ids:
             text = f"case {wrong} of {m.env}: the cases are 0 to {len(cases) - 1}"
             raise RefusedError(Refusal.INVALID_ENV_INSTANCE, text if ids else "no cases were given")
-        return EvaluationRow(
+        return shared(
+            EvaluationRow,
+            m,
             evaluation=f"e-{secrets.token_hex(8)}",
-            key=m.key,
-            env=m.env,
-            bundle=m.bundle,
-            split=m.split,
             case_ids=ids,
             cases=tuple(cases[case_id] for case_id in ids),
             secret=secrets.token_bytes(32) if of is None else of.secret,
-            record=m.record,
             tier=m.sandbox_tier,
-            limits=m.limits,
-            definition=m.definition,
-            replays=m.replays,
-            as_in=m.as_in,
             max_steps=_max_steps(m.env, m.step_limit),
         )
 

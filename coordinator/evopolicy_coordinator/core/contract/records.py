@@ -9,6 +9,7 @@ Rules that this module owns:
 
 from __future__ import annotations
 
+from functools import cache
 from typing import Any, Literal, TypeVar
 
 import msgspec
@@ -371,11 +372,14 @@ def latest_time(snapshot: Snapshot) -> float:
 def shared(kind: type[S], *sources: msgspec.Struct, **others: Any) -> S:
     """Returns a struct of that kind: each field is from `others`, or from the first source that has it."""
     fields = {
-        name: getattr(source, name)
-        for source in reversed(sources)
-        for name in {*kind.__struct_fields__} & {*source.__struct_fields__}
+        name: getattr(source, name) for source in reversed(sources) for name in _common(kind, type(source))
     }
     return kind(**fields | others)
+
+
+@cache
+def _common(kind: type[msgspec.Struct], source: type[msgspec.Struct]) -> frozenset[str]:
+    return frozenset(kind.__struct_fields__) & frozenset(source.__struct_fields__)
 
 
 def submit_done(row: SubmitRow) -> SubmitDone | None:

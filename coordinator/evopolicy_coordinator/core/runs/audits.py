@@ -28,7 +28,7 @@ from evopolicy_common.messages.audit import AuditFinding, AuditRecord
 from evopolicy_coordinator.core.contract import events
 from evopolicy_coordinator.core.contract.effects import CompareAudit, PrepareAudit
 from evopolicy_coordinator.core.contract.reasons import Reason, because
-from evopolicy_coordinator.core.contract.records import AuditRow, WorkerRow
+from evopolicy_coordinator.core.contract.records import AuditRow, WorkerRow, shared
 from evopolicy_coordinator.core.isolation import conflicts
 from evopolicy_coordinator.core.leasing import expiry, fleet, groups
 from evopolicy_coordinator.core.runs import templates
@@ -109,9 +109,7 @@ def sample(state: State, news: EpisodesDone, step: Step) -> None:
 
 
 def _prepare(row: AuditRow, step: Step) -> PrepareAudit:
-    return PrepareAudit(
-        run=row.run, audit=row.audit, group=row.group, index=row.index, stimulus_id=step.stimulus_id
-    )
+    return shared(PrepareAudit, row, stimulus_id=step.stimulus_id)
 
 
 def prepared(state: State, event: events.AuditPrepared, step: Step) -> None:
@@ -144,14 +142,8 @@ def replayed(state: State, news: EpisodesDone, step: Step) -> None:
 
 
 def _compare(row: AuditRow, step: Step) -> CompareAudit:
-    return CompareAudit(
-        run=row.run,
-        audit=row.audit,
-        group=row.group,
-        index=row.index,
-        replays=tuple(f"{row.audit}.{n + 1}" for n in range(len(row.replayed_by))),
-        stimulus_id=step.stimulus_id,
-    )
+    replays = tuple(f"{row.audit}.{n + 1}" for n in range(len(row.replayed_by)))
+    return shared(CompareAudit, row, replays=replays, stimulus_id=step.stimulus_id)
 
 
 def compared(state: State, event: events.AuditCompared, step: Step) -> None:
@@ -389,11 +381,11 @@ def _is_reported(row: AuditRow) -> bool:
 
 
 def _finding(row: AuditRow) -> AuditFinding:
-    return AuditFinding(
+    return shared(
+        AuditFinding,
+        row,
         split=row.kind,
-        submit_index=row.submit_index,
         episode=row.index,
-        player=row.player,
         auditors=row.replayed_by,
         difference=row.difference or row.reason,
         forger=row.replayed_by[0] if row.state == "agreed" else row.forger,

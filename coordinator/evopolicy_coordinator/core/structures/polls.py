@@ -5,8 +5,7 @@ Rules that this module owns: a poll is answered once; at its deadline it is answ
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, NamedTuple
 
 from evopolicy_coordinator.core.contract.events import RequestId
 from evopolicy_coordinator.core.structures import take
@@ -15,8 +14,7 @@ from evopolicy_coordinator.core.structures.timers import Timers
 PollKind = Literal["results", "evaluation", "run", "permit"]
 
 
-@dataclass(slots=True, frozen=True)
-class Poll:
+class Poll(NamedTuple):
     """A waiting request."""
 
     request: RequestId

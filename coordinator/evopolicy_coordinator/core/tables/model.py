@@ -538,8 +538,7 @@ class Occupancy:
 Occupancies = dict[CaseSet | None, dict[str, Occupancy]]
 
 
-@dataclass(slots=True, eq=False)
-class Ask:
+class Ask(NamedTuple):
     """A requested permit."""
 
     row: PermitRow
@@ -547,8 +546,7 @@ class Ask:
     kernel: Kernel
 
 
-@dataclass(slots=True, eq=False)
-class Reversal:
+class Reversal(NamedTuple):
     """Hidden jobs of a case set have precedence on a kernel."""
 
     kernel: Kernel
@@ -576,8 +574,7 @@ class Kernel:
 OutOfService = Literal["draining", "paused"]
 
 
-@dataclass(slots=True, eq=False)
-class LeasePoll:
+class LeasePoll(NamedTuple):
     request: RequestId
     n: int
     warm: frozenset[str]

@@ -12,8 +12,7 @@ Rules that this module owns:
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import msgspec
 
@@ -31,16 +30,14 @@ from evopolicy_coordinator.core.tables.model import Flow, JobGroup, JobState, La
 # The table in `machine` distinguishes news by type, and by `kind` where a type has several.
 
 
-@dataclass(slots=True, eq=False)
-class ResultsPersisted:
+class ResultsPersisted(NamedTuple):
     """A worker reported the result of one lease."""
 
     worker: Worker
     result: JobResult
 
 
-@dataclass(slots=True, eq=False)
-class EpisodesDone:
+class EpisodesDone(NamedTuple):
     """Episodes of a group have their outcomes."""
 
     group: JobGroup
@@ -54,8 +51,7 @@ class EpisodesDone:
         return self.group.kind
 
 
-@dataclass(slots=True, eq=False)
-class JobRetried:
+class JobRetried(NamedTuple):
     """A job is played again after an infrastructure failure."""
 
     job: JobState
@@ -64,8 +60,7 @@ class JobRetried:
     """As `leasing.retry.JobFailure`."""
 
 
-@dataclass(slots=True, eq=False)
-class EnvironmentFailed:
+class EnvironmentFailed(NamedTuple):
     """The environment has ended so many attempts at a job that it is given up."""
 
     group: JobGroup
@@ -77,15 +72,13 @@ class EnvironmentFailed:
         return self.group.kind
 
 
-@dataclass(slots=True, eq=False)
-class ResultsDiffered:
+class ResultsDiffered(NamedTuple):
     """Two results of one episode differed."""
 
     group: JobGroup
 
 
-@dataclass(slots=True, eq=False)
-class FlowPinned:
+class FlowPinned(NamedTuple):
     """A run or an evaluation was pinned to a class of workers."""
 
     flow: Flow
@@ -97,23 +90,20 @@ class FlowPinned:
         return self.flow.of
 
 
-@dataclass(slots=True, eq=False)
-class SubmitEnded:
+class SubmitEnded(NamedTuple):
     """A submit got its verdict."""
 
     run: Run
     row: SubmitRow
 
 
-@dataclass(slots=True, eq=False)
-class AuditsMoved:
+class AuditsMoved(NamedTuple):
     """An audit of a run ended or advanced: the run may have waited for it."""
 
     run: Run
 
 
-@dataclass(slots=True, eq=False)
-class AgentOverdue:
+class AgentOverdue(NamedTuple):
     """A run's agent has kept hidden jobs of closed runs from their kernels for too long."""
 
     run: Run
