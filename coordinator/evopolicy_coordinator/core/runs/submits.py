@@ -21,7 +21,7 @@ from evopolicy_common.messages.gateway import SubmitStatus
 from evopolicy_coordinator.core.agents import requests
 from evopolicy_coordinator.core.contract import events
 from evopolicy_coordinator.core.contract.reasons import NotDoneError
-from evopolicy_coordinator.core.contract.records import SubmitRow
+from evopolicy_coordinator.core.contract.records import SubmitRow, shared
 from evopolicy_coordinator.core.leasing import groups
 from evopolicy_coordinator.core.runs import result_polls, templates
 from evopolicy_coordinator.core.structures.ledger import check_request
@@ -68,15 +68,7 @@ def _again(event: events.Requested[gateway.Submit], row: SubmitRow, step: Step) 
     message = event.message
     if (message.env_instances, message.bundle) != (row.env_instances, row.bundle):
         raise NotDoneError("key_used", key=message.key, submit=row.submit_index)
-    step.reply(event.request, _accepted(row))
-
-
-def _accepted(row: SubmitRow) -> gateway.SubmitAccepted:
-    return gateway.SubmitAccepted(
-        submit_index=row.submit_index,
-        first_global_episode=row.first_global_episode,
-        remaining_budget=row.remaining_budget,
-    )
+    step.reply(event.request, shared(gateway.SubmitAccepted, row))
 
 
 def _accept(state: State, run: Run, event: events.Requested[gateway.Submit], step: Step) -> None:
@@ -99,7 +91,7 @@ def _accept(state: State, run: Run, event: events.Requested[gateway.Submit], ste
     )
     run.submits.append(row)
     run.keys[message.key] = index
-    step.reply(event.request, _accepted(row))
+    step.reply(event.request, shared(gateway.SubmitAccepted, row))
     step.log("info", "submit_accepted", run=run.id, submit=index, episodes=n, remaining=row.remaining_budget)
     failure = message.bundle_error
     if message.rejected is not None:

@@ -27,6 +27,7 @@ from evopolicy_common.records.run_files import RUN_JSON, read_record
 from evopolicy_common.records.suite_folder import INDEX, PAUSED, Entry, Index
 from evopolicy_common.records.summary import Summary, decode_summary
 from evopolicy_common.regular_files import read_regular
+from evopolicy_coordinator.core.contract.records import shared
 from evopolicy_coordinator.web.content.confined import Confined
 from evopolicy_results.reading.environments import learn_names
 from evopolicy_results.reading.reader import find_run_dirs
@@ -285,15 +286,13 @@ def _finished(folder: Path) -> RunFacts:
     outcome, dimensions, tokens = record.outcome, record.experiment_dimensions, record.agent.tokens
     retries = outcome.auxiliary.get("infrastructure_retries")
     submits = Reader([]).submits(folder)
-    return RunFacts(
+    return shared(
+        RunFacts,
+        record,
+        dimensions,
         key=key_of(str(folder)),
         path=folder,
-        run=record.run,
         entry=record.agent.entry or record.model,
-        env=record.env,
-        exp_id=record.exp_id,
-        repeat=record.repeat,
-        attempt=record.attempt,
         state=outcome.status,
         budget=dimensions.episode_budget,
         used=outcome.budget_used,
@@ -305,12 +304,9 @@ def _finished(folder: Path) -> RunFacts:
         started_at=_unix(record.timing.start_time),
         wall_s=record.timing.wall_time_seconds,
         retries=retries if isinstance(retries, int) else 0,
-        hidden_cases=dimensions.hidden_cases,
         score=outcome.score,
         random=outcome.random_score,
         finished=True,
-        start=record.start,
-        replay_of=record.replay_of,
     )
 
 
