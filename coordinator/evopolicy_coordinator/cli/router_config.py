@@ -83,8 +83,8 @@ def router_config(
     own = known.get(f"router/{name}")
     if own is None:
         raise ConfigError(
-            f"router/{name} is not admitted: evopolicy-coordinator certs issue router {name} --host ITS_ADDRESS"
-            f" --out {folder}"
+            f"router/{name} is not admitted: evopolicy-coordinator certs issue router {name}"
+            f" --host ITS_ADDRESS --out {folder}"
         )
     for identity in (*(admit or ()), *(() if uplink == certs.COORDINATOR else (uplink,))):
         if identity not in known:

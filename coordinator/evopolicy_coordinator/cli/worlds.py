@@ -88,8 +88,8 @@ async def _accept(env_ids: list[str], policies: Path, journal: Path, secret: byt
 
 
 class _Trials:
-    """The trials of one epoch's candidates: their journal, and evaluations on the command's own cluster, all on the
-    same cases of an environment."""
+    """The trials of one epoch's candidates: their journal, and evaluations on the command's own cluster. All
+    evaluations of an environment play the same cases."""
 
     def __init__(self, journal: Path, secret: bytes, data: Path, evaluations: Evaluations) -> None:
         self._journal, self._secret, self._epoch = journal, secret, epoch_of(secret)

@@ -3,7 +3,8 @@
 Rules that this module owns:
 - A worker that replays an episode gets its actions and none of their results.
 - A player's report is never trusted to be a valid recording. An unreadable recording is the player's fault; one lost
-  by the store is not. What cannot be compared differs: otherwise odd content would evade the audit.
+  by the store is not. Recordings that cannot be compared differ: otherwise odd
+  content would evade the audit.
 - A difference is described in at most `MAX_TEXT` characters, as the message of a run's end has many.
 """
 

@@ -132,8 +132,8 @@ class ServiceReader:
             if row is None:
                 raise RefusedError(Refusal.UNKNOWN_RUN, f"there is no finished run {run[:64]!r} here")
             text = (
-                f"run {run} was opened before this coordinator kept a journal: it has no commitment to its cases,"
-                " which cannot be added later, so it cannot be published"
+                f"run {run} was opened before this coordinator kept a journal: it has no commitment to its"
+                " cases, which cannot be added later, so it cannot be published"
             )
             require(row.committed is not None, Refusal.BAD_REQUEST, text)
         return tuple(dict.fromkeys(row.epoch for row in rows.values() if row is not None))

@@ -110,7 +110,8 @@ class RequestParser:
             # The core checks whether it knows the session.
             raise RefusedError(
                 Refusal.REVOKED,
-                "the certificate of this machine was revoked or reissued; ask the cluster's operator for a new folder",
+                "the certificate of this machine was revoked or reissued; ask the cluster's operator for a"
+                " new folder",
             )
         return Parsed(subtree, asker, message)
 

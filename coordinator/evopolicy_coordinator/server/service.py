@@ -431,7 +431,7 @@ class Service:
         return self._n_requests
 
     def _let_go(self, older_than_s: float = 0.0) -> None:
-        """Drops, without a reply, queries that have waited at least `older_than_s` seconds; by default all."""
+        """Drops, without a reply, queries that have waited at least `older_than_s` seconds."""
         for request, pending in list(self._pending.items()):
             if time.monotonic() - pending.since < older_than_s:
                 return

@@ -1,4 +1,4 @@
-"""Who may ask what: every wrong token, wrong key and foreign run is refused by the coordinator or by its router."""
+"""The coordinator or its router refuses every wrong token, wrong key and foreign run."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """Results that were really played and published: untouched they hold, and each kind of tampering is named.
 
 Most forgers here are strong: they make all digests, the journal's head and the signature anew, with a key of their own.
-What they cannot make anew is what follows from something else.
+They cannot make anew a field that follows from another one.
 """
 
 from __future__ import annotations

@@ -83,7 +83,7 @@ def answer(state: State, poll: Poll, step: Step) -> None:
 
 
 def demand_permit(state: State, run: Run, step: Step) -> None:
-    """Refuse a request for now (UNAVAILABLE) while its run's agent, which may be on any machine, lacks a permit."""
+    """Raises NotDoneError (UNAVAILABLE) while a run's agent, which may be on any machine, lacks a permit."""
     waits_for = _implied(state, run, step) if run.state.phase == "open" else None
     if waits_for is not None:
         raise NotDoneError("may_not_start", waits_for=waits_for)

@@ -89,7 +89,7 @@ class ReadFinished(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class AuditEffect(msgspec.Struct, frozen=True, kw_only=True):
-    """Read recordings for an audit of outcome `index` of `group`, in the background: an event answers later."""
+    """Read recordings for an audit of outcome `index` of `group`, in the background; an event follows."""
 
     run: str
     audit: str
@@ -99,13 +99,13 @@ class AuditEffect(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class PrepareAudit(AuditEffect, frozen=True, kw_only=True):
-    """Store the actions from the outcome's recording as a separate blob, without observations, rewards or results, and
-    raise `AuditPrepared`."""
+    """Store the actions from the outcome's recording as a separate blob, without observations, rewards or
+    results, and raise `AuditPrepared`."""
 
 
 class CompareAudit(AuditEffect, frozen=True, kw_only=True):
-    """Compare the outcome at index 0 of the last group in `replays` with the audited one, and with the replay before
-    it, bit for bit; raise `AuditCompared`."""
+    """Compare the outcome at index 0 of the last group in `replays` with the audited one, and with the replay
+    before it, bit for bit; raise `AuditCompared`."""
 
     replays: tuple[str, ...]
     """One or two groups of one outcome each."""

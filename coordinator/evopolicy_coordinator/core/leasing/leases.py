@@ -106,8 +106,8 @@ def list_hidden(state: State, lease: Lease, worker: Worker, step: Step) -> None:
     if lease.job.priority != TRAIN:
         lease.hidden_in = worker.profile.hidden[lease.job.priority]
         lease.hidden_in[lease] = None
-        # Train jobs that wait already (they avoided the worker, or the hidden job was adopted from its heartbeat) may
-        # stop it without any further event.
+        # Train jobs that wait already (they avoided the worker, or the hidden job was adopted from its
+        # heartbeat) may stop it without any further event.
         for lane in worker.profile.busy:
             if lane.n_ready[TRAIN]:
                 state.timers.arm_once(("lane", lane.key), step.now + queue.RECHECK_S)

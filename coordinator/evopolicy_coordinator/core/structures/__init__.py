@@ -14,7 +14,7 @@ class InvariantError(AssertionError):
 
 
 def take(index: dict[K, dict[N, T]], key: K, name: N) -> T | None:
-    """Removes and returns the entry under a key and a name; None when it is missing. A key without names goes."""
+    """Removes and returns the entry under a key and a name; None when it is missing. Drops an empty key."""
     there = index.get(key)
     taken = None if there is None else there.pop(name, None)
     if there is not None and not there:

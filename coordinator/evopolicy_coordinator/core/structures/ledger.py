@@ -64,7 +64,7 @@ class Ledger:
 def check_request(
     env_instances: tuple[int, ...], *, n_cases: int, minimum: int, maximum: int, available: int
 ) -> None:
-    """Raises NotDoneError if these train cases cannot be played. Checks in the order that the protocol prescribes."""
+    """Raises NotDoneError if these train cases cannot be played. Checks in the protocol's order."""
     n = len(env_instances)
     for case_id in env_instances:
         if not 0 <= case_id < n_cases:

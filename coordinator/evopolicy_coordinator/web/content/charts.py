@@ -120,7 +120,7 @@ def _path(line: Line, x: Callable[[float], float], y: Callable[[float], float]) 
 
 
 def _thinned(points: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
-    """Those of finite x, at most `_MAX_POINTS`: of each stretch its least and its greatest value, in order."""
+    """At most `_MAX_POINTS` of finite x: of each stretch its least and its greatest value, in order."""
     points = [(x, y) for x, y in points if math.isfinite(x)]
     if len(points) <= _MAX_POINTS:
         return points

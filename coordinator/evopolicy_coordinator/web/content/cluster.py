@@ -56,7 +56,7 @@ class Cluster:
         self.status: StatusReply | None = None
         self.history: deque[Sample] = deque(maxlen=_SAMPLES)
         self.trouble = ""
-        """Why there is no answer now; empty while there is."""
+        """Why the coordinator does not answer; empty while it does."""
         self.operator: OperatorClient | None = None
         self.retries: OrderedDict[str, dict[RetriedJobs, None]] = OrderedDict()
         """Repeated jobs of each run, oldest first; the coordinator reports only each run's last ones."""
@@ -74,16 +74,16 @@ class Cluster:
         return self.status is not None and time.monotonic() - self._at < STALE_S
 
     def wake(self) -> None:
-        """Somebody looks: the next question need not wait for the idle pause."""
+        """A page is open: the next request does not wait for the idle pause."""
         self._wake.set()
 
     def acted(self) -> None:
-        """Something was changed: the coordinator is asked at once, for a new answer."""
+        """An action was carried out: a new status is requested at once."""
         self._acted.set()
         self._wake.set()
 
     async def run(self) -> None:
-        """Asks until it is cancelled; a coordinator that is away is asked again."""
+        """Requests the status until it is cancelled; retries while the coordinator does not answer."""
         while True:
             try:
                 async with transport.connect(self._credentials) as link:
@@ -103,7 +103,7 @@ class Cluster:
             try:
                 status = await operator.status(max_age_s)
             except EvopolicyError as error:
-                # The link makes itself anew; what it needs is time.
+                # The link connects again by itself, after a pause.
                 self._failed(str(error))
                 await asyncio.sleep(_RETRY_S)
                 continue

@@ -40,7 +40,7 @@ class Confined:
         self.root = root
 
     def open(self, path: str) -> int:
-        """A descriptor of a regular file, which the caller closes. Raises NotThereError for a refused path."""
+        """A descriptor of a regular file, for the caller to close. NotThereError for a refused path."""
         *folders, name = _parts(path)
         folder = self._folder(folders)
         try:

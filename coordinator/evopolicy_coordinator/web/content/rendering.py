@@ -1,5 +1,5 @@
-"""From templates to HTML: parts and pages, the rows of a table that a request selects, and how numbers and states are
-written. Markup is in `templates/`; every value is escaped there."""
+"""From templates to HTML: parts and pages, the rows of a table that a request selects, and how numbers and
+states are written. Markup is in `templates/`; every value is escaped there."""
 
 from __future__ import annotations
 

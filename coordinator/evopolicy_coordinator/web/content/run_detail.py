@@ -168,7 +168,7 @@ class Detail:
         return self.files.read(path, MAX_TEXT).decode("utf-8", "replace")
 
     def played(self, folder: str) -> tuple[int, dict[str, list[Line]], str]:
-        """Number of steps of an episode, its columns by title of a plot, and a note; what can be drawn."""
+        """Number of steps of an episode, its columns by title of a plot, and a note on others."""
         lines = self.files.read(f"{folder}/trajectory.jsonl", _MAX_TRAJECTORY).splitlines()
         rows = list(itertools.islice(objects(lines), MAX_STEPS))
         inline = [row.get("obs") for row in rows]
@@ -306,8 +306,8 @@ _FORMS: Mapping[str, Sequence[tuple[str, str, str]]] = {
     "item mcp_tool_call": [("tool", "mcp_tool_call", "arguments changes")],
     "item file_change": [("tool", "file_change", "arguments changes")],
 }
-"""By the type of a line, of a block of a message, or of a Codex item: kind and title of its entries, and the fields of
-which the first that is not empty is the text."""
+"""By the type of a line, of a block of a message, or of a Codex item: kind and title of its entries, and the
+fields of which the first that is not empty is the text."""
 
 
 def _messages(at: int, line: bytes) -> Iterator[Message]:

@@ -1,4 +1,4 @@
-"""Who is named a forger, who is not, and what becomes of it."""
+"""Workers that are named forgers, those that are not, and the consequences."""
 
 from __future__ import annotations
 

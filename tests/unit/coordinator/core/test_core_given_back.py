@@ -1,4 +1,4 @@
-"""What the policy of a hidden job had returned when the job was stopped stands: the next attempt goes on from there."""
+"""Actions that a stopped hidden job's policy had returned stand: the next attempt continues from there."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Who gets what: priorities, fair share, batches, warmth, preemption, placement, drain."""
+"""The scheduler: priorities, fair share, batches, warmth, preemption, placement, drain."""
 
 from __future__ import annotations
 

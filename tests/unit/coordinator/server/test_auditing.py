@@ -1,4 +1,4 @@
-"""What audits need of the store: actions by themselves, and comparisons that nothing a worker reports can upset."""
+"""Audits read actions by themselves from the store, and compare recordings whatever a worker reports."""
 
 from __future__ import annotations
 

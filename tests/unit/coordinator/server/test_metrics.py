@@ -1,4 +1,4 @@
-"""What the metrics count, by the effects of the real core."""
+"""The metrics, counted from the effects of the real core."""
 
 from __future__ import annotations
 

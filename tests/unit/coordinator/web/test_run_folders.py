@@ -1,4 +1,4 @@
-"""What the live view makes of run folders, a sweep's index, and the cluster's word."""
+"""The live view combines run folders, a sweep's index, and the cluster's status."""
 
 from __future__ import annotations
 

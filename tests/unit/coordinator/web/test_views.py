@@ -1,4 +1,4 @@
-"""What the pages of a run and of the cluster tell, by what the coordinator and the files say."""
+"""The pages of a run and of the cluster, from the coordinator's status and the files."""
 
 from __future__ import annotations
 
