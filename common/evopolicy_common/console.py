@@ -6,7 +6,7 @@ This is a module of its own because rich is large and most commands do not need 
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import rich.console
 from rich.console import ConsoleOptions, JustifyMethod, RenderableType, RenderResult
@@ -17,6 +17,9 @@ from rich.text import Text
 
 from evopolicy_common.installation import as_called
 from evopolicy_common.terminal import harmless
+
+if TYPE_CHECKING:
+    from rich.progress import Progress
 
 WIDTH = 200
 """Columns without a terminal: a truncated table is worse than a long line."""
@@ -121,6 +124,14 @@ def listing(
     for one in records:
         made.add_row(*(cell(one) for cell in columns.values()))
     return made
+
+
+def progress_bars(console: Terminal) -> Progress:
+    """A bar for each task, shown on a terminal alone."""
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    return Progress(*columns, console=console, transient=True, disable=not console.is_terminal)
 
 
 def terminal(*, stderr: bool = False) -> Terminal:

@@ -31,7 +31,7 @@ from evopolicy_common.wire.operator_client import DESCRIPTION_S, OperatorClient
 from evopolicy_common.wire.transport import Link
 
 Tell = Callable[[int, str], None]
-"""Called with the number of finished episodes and what the cluster waits for (empty: nothing)."""
+"""Called with the number of finished episodes and the reason why the cluster waits (empty: none)."""
 RANDOM = -1
 """Submit index of the random reference."""
 _WORKER_PAUSE_S = 0.3
@@ -93,7 +93,6 @@ class Evaluations:
             await self.ask.upload(bundle.digest, bundle.packed)
         is_random = cases.submit_index == RANDOM
         message = Evaluate(
-            token="",
             key=uuid.uuid4().hex,
             env=env,
             bundle=None if bundle is None else bundle.digest,
@@ -118,32 +117,30 @@ class Evaluations:
                 hidden_evaluation=conditions.hidden_evaluation,
             ),
         )
-        left = dict(enumerate(indexes))
+        missing = dict(enumerate(indexes))
         async for outcome in self.outcomes(message):
-            yield left.pop(outcome.index), outcome
-        for index in left.values():
+            yield missing.pop(outcome.index), outcome
+        for index in missing.values():
             yield index, None
 
     async def recording(self, outcome: EpisodeOutcome) -> Trajectory:
         assert outcome.trajectory is not None
         return decode(await self.ask.fetch(outcome.trajectory))
 
-    async def versions(self, message: DescribeEnvironment, *, wait: bool) -> EnvironmentState:
+    async def versions(self, message: DescribeEnvironment) -> EnvironmentState:
         """The environment's state, with the versions of the workers that offer it.
 
-        With `wait` until there is a worker, as the first may still be starting, but not for a run that the coordinator
-        does not know.
+        On an own cluster it waits for the first worker, but not for a run that the coordinator does not know.
         """
         until = time.monotonic() + DESCRIPTION_S
         while True:
             state = await self.ask.describe(message)
             unknown = message.run and not state.knows_run
-            if state.fingerprints or unknown or not wait or time.monotonic() > until:
+            if state.fingerprints or unknown or not self.ask.own or time.monotonic() > until:
                 return state
-            if self.ask.own:
-                *_, failed = await self.ask.environments()
-                if message.env in failed:
-                    raise BrokenEnvironmentError("; ".join(failed[message.env].values()))
+            *_, failed = await self.ask.environments()
+            if message.env in failed:
+                raise BrokenEnvironmentError("; ".join(failed[message.env].values()))
             await asyncio.sleep(_WORKER_PAUSE_S)
 
 

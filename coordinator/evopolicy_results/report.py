@@ -22,7 +22,7 @@ from typing import Any
 import msgspec
 
 from evopolicy_common.errors import ConfigError
-from evopolicy_results.behaviour.trace import Trace, trace
+from evopolicy_results.behaviour.trace import trace
 from evopolicy_results.figures import drawings_of, timelines_of
 from evopolicy_results.figures.plot import Plot
 from evopolicy_results.html.pages import (
@@ -45,8 +45,10 @@ from evopolicy_results.tables.run_tables import feedback_use, submits_of
 from evopolicy_results.tables.table import Table, to_csv, to_markdown
 
 REPORT_SCHEMA_VERSION = 1
-_OURS = frozenset({"index.html", "report.json", "figures", "tables", "traces", "replays"})
+_FOLDERS = ("figures", "tables", "traces", "replays")
+_OURS = frozenset({"index.html", "report.json", *_FOLDERS})
 _MEDIA = (".mp4", ".png", ".webm")
+_NO_NAME = re.compile(r"[^A-Za-z0-9.-]+")
 _WRITTEN = {"csv": to_csv, "md": to_markdown, "tex": to_latex}
 
 Progress = Callable[[str, int, int], None]
@@ -69,7 +71,9 @@ def write_report(
     and write the pages of runs; call it on the main thread.
     """
     tell = progress if progress is not None else lambda what, done, total: None
-    _prepare(out)
+    check_folder(out, _OURS.__contains__, "report")
+    for name in _FOLDERS:
+        shutil.rmtree(out / name, ignore_errors=True)
     look = looks(study.entries, study.reference)
     trace_links = {run.name: f"traces/{slug(run)}.html" for run in study.runs} if traces else {}
     tables = tables_of(study)
@@ -93,12 +97,12 @@ def write_report(
             tell("run pages", done - len(drawings), len(pages))
     plots += timelines_of(study)
     for plot in plots:
-        _write(out / "figures" / f"{plot.name}.svg", plot.svg)
+        write_file(out / "figures" / f"{plot.name}.svg", plot.svg)
     if traces:
         tables.append(feedback_use(submits))
     for done, table in enumerate(tables, start=1):
         for _, suffix in FORMS:
-            _write(out / "tables" / f"{table.name}.{suffix}", _WRITTEN[suffix](table))
+            write_file(out / "tables" / f"{table.name}.{suffix}", _WRITTEN[suffix](table))
         tell("tables", done, len(tables))
     (out / "report.json").write_bytes(_report_json(study, tables, plots))
     text = index_page(
@@ -110,38 +114,34 @@ def write_report(
         trace_links=trace_links,
         replay_links=_write_replays(study, out, look),
     )
-    return _write(out / "index.html", text)
+    return write_file(out / "index.html", text)
 
 
 def slug(run: Run) -> str:
     """A file name for the run's page: readable, and unique by a hash of the run's name."""
-    text = re.sub(r"[^A-Za-z0-9.-]+", "-", f"{run.env}-{run.entry}-{run.record.exp_id}").strip("-.")[:90]
+    text = _NO_NAME.sub("-", f"{run.env}-{run.entry}-{run.record.exp_id}").strip("-.")[:90]
     return f"{text}-{hashlib.sha256(run.name.encode()).hexdigest()[:8]}"
 
 
-def _prepare(out: Path) -> None:
-    if out.exists():
-        if not out.is_dir():
-            raise ConfigError(f"--out {out} is a file; give a folder")
-        others = sorted(child.name for child in out.iterdir() if child.name not in _OURS)
-        if others:
-            raise ConfigError(
-                f"--out {out} holds other files ({', '.join(others[:3])}…); give a new or an earlier report's folder"
-            )
-        for name in ("figures", "tables", "traces", "replays"):
-            shutil.rmtree(out / name, ignore_errors=True)
-    for name in ("figures", "tables"):
-        (out / name).mkdir(parents=True, exist_ok=True)
+def check_folder(out: Path, is_ours: Callable[[str], bool], kind: str) -> None:
+    """Raises ConfigError when `out` is a file, or holds files that no earlier command of this kind wrote there."""
+    if out.exists() and not out.is_dir():
+        raise ConfigError(f"--out {out} is a file; give a folder")
+    names = sorted(child.name for child in out.iterdir()) if out.exists() else []
+    if others := [name for name in names if not is_ours(name)]:
+        raise ConfigError(
+            f"--out {out} holds other files ({', '.join(others[:3])}…); give a new or an earlier {kind}'s folder"
+        )
 
 
 def _made(item: tuple[dict[str, set[tuple[str, str]]], partial[Any]]) -> Any:
     names_in_runs.update(item[0])  # those of another process
     made = item[1]()
-    if isinstance(made, Plot):
-        from evopolicy_results.figures.style import drawn  # imports matplotlib
+    if not isinstance(made, Plot):
+        return made
+    from evopolicy_results.figures.style import drawn  # imports matplotlib
 
-        made = drawn(made)
-    return made
+    return drawn(made)
 
 
 def _lost(item: tuple[Any, partial[Any]], why: str) -> Any:
@@ -155,10 +155,21 @@ def _lost(item: tuple[Any, partial[Any]], why: str) -> Any:
 def _page(
     run: Run, out: Path, look: Look | None, beside: Sequence[tuple[str, Look | None, str]]
 ) -> list[dict[str, Any]]:
-    """Writes the page of a run and returns its submits."""
+    """Writes the page of a run, with its images and videos beside it, and returns its submits."""
+    name, folder = slug(run), out / "traces"
+    image_links: dict[int, list[tuple[str, str]]] = {}
+    videos: dict[int, str] = {}
     try:
         traced = trace(run)
-        _write_trace(traced, out / "traces", look, beside)
+        for row in traced.rows:
+            stem, index = f"{name}/{row.submit.label}", row.submit.index
+            for number, path in enumerate(row.images):
+                if copied := _copied(path, folder, f"{stem}-{number}"):
+                    image_links.setdefault(index, []).append((path.name, copied))
+            if row.video is not None and (copied := _copied(row.video, folder, stem)):
+                videos[index] = copied
+        text = trace_page(traced, look=look, image_links=image_links, videos=videos, beside=beside)
+        write_file(folder / f"{name}.html", text)
         return submits_of(traced)
     except Exception as error:
         # A bad log or source that an agent wrote must spoil at most its own page.
@@ -166,7 +177,7 @@ def _page(
 
 
 def _write_failed(run: Run, out: Path, why: str) -> list[dict[str, Any]]:
-    _write(out / "traces" / f"{slug(run)}.html", page("failed", title=run_title(run), reason=why))
+    write_file(out / "traces" / f"{slug(run)}.html", page("failed", title=run_title(run), reason=why))
     return []
 
 
@@ -181,31 +192,14 @@ def _beside(run: Run, runs: Sequence[Run], look: Mapping[str, Look]) -> list[tup
     return [(entry, look.get(entry), f"{slug(other)}.html") for entry, other in chosen.items()]
 
 
-def _write_trace(
-    traced: Trace, folder: Path, look: Look | None, beside: Sequence[tuple[str, Look | None, str]]
-) -> None:
-    name = slug(traced.run)
-    image_links: dict[int, list[tuple[str, str]]] = {}
-    videos: dict[int, str] = {}
-    for row in traced.rows:
-        stem, index = f"{name}/{row.submit.label}", row.submit.index
-        for number, path in enumerate(row.images):
-            if copied := _copied(path, folder, f"{stem}-{number}"):
-                image_links.setdefault(index, []).append((path.name, copied))
-        if row.video is not None and (copied := _copied(row.video, folder, stem)):
-            videos[index] = copied
-    text = trace_page(traced, look=look, image_links=image_links, videos=videos, beside=beside)
-    _write(folder / f"{name}.html", text)
-
-
 def _copied(path: Path, folder: Path, stem: str) -> str | None:
     """Copies a file and returns its path in `folder`; None when it is missing or a link."""
     if not path.is_file() or path.is_symlink():
         return None
-    target = folder / f"{stem}{path.suffix.lower()}"
-    target.parent.mkdir(parents=True, exist_ok=True)
-    shutil.copyfile(path, target)
-    return f"{stem}{path.suffix.lower()}"
+    name = f"{stem}{path.suffix.lower()}"
+    (folder / name).parent.mkdir(parents=True, exist_ok=True)
+    shutil.copyfile(path, folder / name)
+    return name
 
 
 def _write_replays(study: Study, out: Path, look: Mapping[str, Look]) -> dict[str, str]:
@@ -224,13 +218,13 @@ def _write_replays(study: Study, out: Path, look: Mapping[str, Look]) -> dict[st
             by_env.setdefault(run.env, []).append(PlayedEpisode(run, replay, video, strip))
     links: dict[str, str] = {}
     for env in ordered_environments(by_env):
-        links[env] = f"replays/{re.sub(r'[^A-Za-z0-9.-]+', '-', env)}.html"
-        _write(out / links[env], replays_page(env, by_env[env], look))
+        links[env] = f"replays/{_NO_NAME.sub('-', env)}.html"
+        write_file(out / links[env], replays_page(env, by_env[env], look))
     return links
 
 
-def _write(path: Path, text: str) -> Path:
-    path.parent.mkdir(exist_ok=True)
+def write_file(path: Path, text: str) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(text, encoding="utf-8", errors="replace")
     return path
 

@@ -115,7 +115,7 @@ class Forger:
         self.files[name] = contents.pack_recordings(recordings)
 
     def returns(self, group: str) -> list[float]:
-        """What the rewards of a group's recordings come to."""
+        """The sums of the rewards in a group's recordings."""
         recordings = contents.unpack_recordings(self.files[f"runs/0000/actions/{group}"])
         return [return_of(decode(data)) for data in recordings if data is not None]
 
@@ -149,13 +149,27 @@ class Forger:
         self.json(f"{folder}/{contents.RUN}", score)
 
         def entries(lines: list[bytes]) -> list[bytes]:
-            found = [json.loads(line) for line in lines]
-            for each in found:
+            own = [json.loads(line) for line in lines]
+            for each in own:
                 if each["kind"] == "ended" and each["run"] == result["run"]:
                     each["result"] = contents.digest(self.files[name])
-            return [spelt(contents.JOURNAL, each) for each in found]
+            return [spelt(contents.JOURNAL, each) for each in own]
 
         self.entries(entries)
+
+    def raise_returns(self, change: Callable[[list[float]], list[float]]) -> None:
+        """Changes the held-out returns of the first run, and all that the journal and `run.json` tell of them."""
+
+        def told(result: dict[str, Any]) -> None:
+            result["heldout_returns"] = change(result["heldout_returns"])
+            result["final_score"] = mean(result["heldout_returns"])
+
+        self.begin_anew(told)
+
+    def invent_returns(self) -> None:
+        """Held-out returns that nobody got, without the recordings that would contradict them."""
+        self.raise_returns(lambda old: [each + 100.0 for each in old])
+        del self.files["runs/0000/actions/heldout-001"]
 
     def place(self) -> None:
         """Tells the places and heads that the journal has in every `run.json`."""

@@ -30,6 +30,18 @@ def read_record(folder: Path) -> RunRecord:
     return record
 
 
+def read_or_reason(folder: Path) -> RunRecord | str:
+    """The record of a finished run, or why there is none that can be read."""
+    try:
+        return read_record(folder)
+    except FileNotFoundError:
+        return f"the run did not finish: it has no {RUN_JSON}"
+    except OSError as error:
+        return f"{RUN_JSON} cannot be read: {error.strerror}"
+    except ProtocolError as error:
+        return f"{RUN_JSON}: {error}"
+
+
 def check_places(folder: Path, artifacts: Artifacts) -> None:
     """Raises ProtocolError when a place of a run's files is outside its directory, also by a link."""
     named = msgspec.structs.asdict(artifacts)

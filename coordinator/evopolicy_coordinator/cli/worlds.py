@@ -172,6 +172,6 @@ class _Trials:
         return math.fsum(returns) / len(returns)
 
     async def _description(self, world: str) -> EnvironmentDescription:
-        await self._evaluations.versions(DescribeEnvironment(env=world), wait=True)
+        await self._evaluations.versions(DescribeEnvironment(env=world))
         offered, *_ = await self._evaluations.ask.environments()
         return next(each.description for each in offered if each.description.env == world)

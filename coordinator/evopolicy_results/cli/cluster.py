@@ -9,12 +9,11 @@ from collections.abc import AsyncIterator, Callable, Coroutine, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
-import msgspec
 import typer
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.progress import Progress
 
 from evopolicy_common.cli.conventions import CLUSTER, fail
-from evopolicy_common.console import Terminal
+from evopolicy_common.console import Terminal, progress_bars
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.local.cluster import LocalCluster, local_cluster, unless_failed
 from evopolicy_common.messages.episode import Tier
@@ -40,13 +39,9 @@ Slots = Annotated[
         min=1, max=1024, help="With --local: episodes played at the same time.", rich_help_panel=CLUSTER
     ),
 ]
-
-
 Runs = Annotated[
     list[Path], typer.Argument(metavar="RUNS...", help="Finished runs' directories, or folders of them.")
 ]
-
-
 _SHOWN = 20
 
 
@@ -56,50 +51,66 @@ def first(lines: Sequence[str]) -> list[str]:
     return [*lines[:_SHOWN], *more]
 
 
-class Where(msgspec.Struct, frozen=True, kw_only=True):
+class Where:
     """The cluster that the options name."""
 
-    connect: tuple[str, ...]
-    file: Path | None
-    local: bool
-    state: Path | None
-    data: Path | None = None
+    def __init__(
+        self,
+        connect: list[str] | None,
+        file: Path | None,
+        local: bool,
+        state: Path | None,
+        data: Path | None = None,
+        *,
+        runs: Sequence[Path],
+        needs_state: bool = True,
+    ) -> None:
+        """Ends the command if the options contradict each other, or belong to another cluster than these runs.
+
+        `needs_state`: whether the state folder has to exist; otherwise a temporary one replaces the usual one."""
+        for option, value in (("--state", state), ("--data", data)):
+            if value is not None and not local:
+                fail(f"{option} applies only with --local")
+        if local and (connect or file is not None):
+            fail("--local starts a cluster of its own; it cannot be combined with --connect or --credentials")
+        if local and state is None and (states := _sweeps_states(runs)):
+            # Named, not taken: a folder of runs may be another's, and its state would decide what counts as right.
+            several = "; the sweeps one by one" if len(states) > 1 else ""
+            fail(f"{states[0].parent} is a sweep with a cluster of its own: add --state {states[0]}{several}")
+        self.local, self.state = local, state
+        self._connect, self._file, self._data, self._needs_state = connect or (), file, data, needs_state
 
     @contextlib.asynccontextmanager
     async def link(
-        self, kind: str, *, needs_state: bool = True, packages: Sequence[str] = ()
+        self, kind: str, packages: Sequence[str] = ()
     ) -> AsyncIterator[tuple[transport.Link, LocalCluster | None]]:
         """A link to the cluster; with `--local` the cluster too, which has no workers yet.
 
-        `kind` names the logs of that cluster. `needs_state`: whether its state folder has to exist; otherwise a
-        temporary one replaces the usual one. `packages`: those that policies may import besides numpy. Raises
-        ConfigError for a folder that does not exist.
+        `kind` names the logs of that cluster. `packages`: those that policies may import besides numpy. Raises
+        ConfigError for a state folder that does not exist.
         """
         async with contextlib.AsyncExitStack() as stack:
-            file, cluster = self.file, None
+            file, cluster = self._file, None
             if self.local:
                 folder: Path | None = self.state or credentials.local_state_dir()
                 if folder is not None and not folder.is_dir():
-                    if needs_state or self.state is not None:
+                    if self._needs_state or self.state is not None:
                         raise ConfigError(f"--state {folder}: no such state folder")
                     folder = None
                 cluster = await stack.enter_async_context(
-                    local_cluster(kind, state=folder, data=self.data, policy_packages=packages)
+                    local_cluster(kind, state=folder, data=self._data, policy_packages=packages)
                 )
                 file = cluster.operator_file
-            found = credentials.find("operator", self.connect, file)
-            yield await stack.enter_async_context(transport.connect(found)), cluster
+            link = transport.connect(credentials.find("operator", tuple(self._connect), file))
+            yield await stack.enter_async_context(link), cluster
 
     @contextlib.asynccontextmanager
     async def playing(
-        self, kind: str, console: Terminal, *, needs_state: bool = True, packages: Sequence[str] = ()
+        self, kind: str, console: Terminal, packages: Sequence[str] = ()
     ) -> AsyncIterator[Playing]:
         """Evaluations on the cluster of `link`, with a progress bar while the body runs."""
-        columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-        async with self.link(kind, needs_state=needs_state, packages=packages) as (link, cluster):
-            with Progress(
-                *columns, console=console, transient=True, disable=not console.is_terminal
-            ) as progress:
+        async with self.link(kind, packages) as (link, cluster):
+            with progress_bars(console) as progress:
                 yield Playing(link, cluster, progress, kind)
 
 
@@ -136,28 +147,6 @@ class Playing:
         await unless_failed(asyncio.create_task(work()), failed)
 
 
-def where_of(
-    connect: list[str] | None,
-    file: Path | None,
-    local: bool,
-    state: Path | None,
-    data: Path | None = None,
-    *,
-    runs: Sequence[Path],
-) -> Where:
-    """The cluster of these options, for these runs' folders. Ends the command if they contradict each other."""
-    for option, value in (("--state", state), ("--data", data)):
-        if value is not None and not local:
-            fail(f"{option} applies only with --local")
-    if local and (connect or file is not None):
-        fail("--local starts a cluster of its own; it cannot be combined with --connect or --credentials")
-    if local and state is None and (states := _sweeps_states(runs)):
-        # Named, not taken: a folder of runs may be another's, and its state would decide what counts as right.
-        several = "; the sweeps one by one" if len(states) > 1 else ""
-        fail(f"{states[0].parent} is a sweep with a cluster of its own: add --state {states[0]}{several}")
-    return Where(connect=tuple(connect or ()), file=file, local=local, state=state, data=data)
-
-
 def _sweeps_states(runs: Sequence[Path]) -> list[Path]:
     """State folders of `evopolicy suite --local` above these folders of runs, or one below them."""
     roots = [root.resolve() for root in runs]
@@ -165,5 +154,5 @@ def _sweeps_states(runs: Sequence[Path]) -> list[Path]:
         each for root in roots for each in (root, *root.parents, *(root.glob("*/") if root.is_dir() else ()))
     ]
     states = [folder / credentials.SWEEP_STATE for folder in folders]
-    # Not `Path.is_file`, which raises for folders that this user may not look into.
+    # Not `Path.is_file`, which raises for folders that this user may not read.
     return list(dict.fromkeys(state for state in states if os.path.isfile(state / "coordinator.sqlite")))

@@ -1,8 +1,4 @@
-"""`evopolicy publish`, `evopolicy check`: results that others can check, and the check.
-
-Exit codes of `check`: 0 nothing contradicts, 1 something does, 2 wrong usage or no file of published results, 3 a
-replay that was asked for could not be done, or not of all parts of a run.
-"""
+"""`evopolicy publish`, `evopolicy check`: results that others can check, and the check."""
 
 from __future__ import annotations
 
@@ -20,6 +16,7 @@ import typer
 from evopolicy_common.cli.conventions import (
     Connect,
     CredentialsFile,
+    Json,
     end_on_sigterm,
     fail,
     fail_on_our_errors,
@@ -30,14 +27,13 @@ from evopolicy_common.errors import DECODE_ERRORS, ConfigError, ProtocolError
 from evopolicy_common.processes.packages import checked_names
 from evopolicy_common.regular_files import read_given
 from evopolicy_common.terminal import counted, one_line, say, say_json
-from evopolicy_results.cli.cluster import Local, Runs, State, first, where_of
+from evopolicy_results.cli.cluster import Local, Runs, State, Where, first
 from evopolicy_results.publish import replay as replays
-from evopolicy_results.publish import rules
+from evopolicy_results.publish import rules, run_rules
 from evopolicy_results.publish.archive import Archive
 from evopolicy_results.publish.collect import Published, Publisher, find_runs, needles_of_this_machine
 from evopolicy_results.publish.contents import Countersignature, Listed
 from evopolicy_results.publish.findings import KINDS, Checked
-from evopolicy_results.publish.scan import scan_published
 
 FAILED, NOT_REPLAYED = 1, 3
 _SHOWN = 20
@@ -79,7 +75,7 @@ def publish(
             help="Also write the evaluation card and a Croissant description of the file into this folder.",
         ),
     ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print what was published as JSON.")] = False,
+    as_json: Json = False,
 ) -> None:
     """Write finished runs into one signed file that anyone can check, and make their cases public.
 
@@ -87,7 +83,7 @@ def publish(
     names, users, variables and tokens are removed; removed.json in the file lists them. Keys in policies or recordings,
     and values that a run passed to its agent, stop the command: see --remove-findings and --accept-finding.
     """
-    where = where_of(connect, file, local, state, runs=runs)
+    where = Where(connect, file, local, state, runs=runs)
     if out.exists():
         fail(f"--out {out} is there already; name a new file")
     if not out.absolute().parent.is_dir():
@@ -97,7 +93,7 @@ def publish(
 
     async def work() -> Published:
         end_on_sigterm()
-        found, left = find_runs(runs)
+        finished, left_out = find_runs(runs)
         async with where.link("publish") as (link, _):
             needles = needles_of_this_machine(link, *runs, *([state] if state else []))
             publisher = Publisher(
@@ -108,7 +104,7 @@ def publish(
                 remove_findings=remove_findings,
                 accepted=accept_finding or (),
             )
-            return await publisher.publish(found, out, left, licence=licence, card=card)
+            return await publisher.publish(finished, out, left_out, licence=licence, card=card)
 
     with fail_on_our_errors():
         done = asyncio.run(work())
@@ -138,11 +134,8 @@ def check(
         str | None,
         typer.Option(
             metavar="SHARE",
-            help=(
-                "Also play policies that declare themselves deterministic, in the sandbox, and compare their actions:"
-                " `5%` of the"
-                " episodes, or `all`."
-            ),
+            help="Also play policies that declare themselves deterministic, in the sandbox, and compare their actions:"
+            " `5%` of the episodes, or `all`.",
         ),
     ] = None,
     policy_package: Annotated[
@@ -150,10 +143,8 @@ def check(
         typer.Option(
             "--policy-package",
             metavar="NAME",
-            help=(
-                "With --policies: package that policies may import besides numpy, where their run names it; may be"
-                " repeated."
-            ),
+            help="With --policies: package that policies may import besides numpy, where their run names it; may be"
+            " repeated.",
         ),
     ] = None,
     identity: Annotated[
@@ -169,7 +160,7 @@ def check(
     ] = None,
     seed: Annotated[int | None, typer.Option(help="Seed of the draw; default: random.")] = None,
     slots: Annotated[int, typer.Option(min=1, max=1024, help="Episodes at the same time.")] = 2,
-    as_json: Annotated[bool, typer.Option("--json", help="Print all findings as JSON.")] = False,
+    as_json: Json = False,
 ) -> None:
     """Check published results.
 
@@ -187,31 +178,32 @@ def check(
             fail("--policy-package goes with --policies")
         noted = [_noted(each) for each in head or ()]
         drawn = random.SystemRandom().randrange(2**32) if seed is None else seed
-        play_them = functools.partial(
-            replays.play_policies, packages=frozenset(checked_names(policy_package))
-        )
+        packages = frozenset(checked_names(policy_package))
+        play_policies = functools.partial(replays.play_policies, packages=packages)
         try:
             with Archive(file) as archive:
                 checked = rules.check(archive, identity or "", noted)
-                scan_published(archive, checked)
+                run_rules.scan_published(archive, checked)
                 contradicts = checked.failed
                 if share is None:
                     checked.add("replay", "open", "not asked for; --replay 5% plays recorded actions again")
-                elif not contradicts:
-                    asyncio.run(_play("replay", replays.replay, archive, checked, share, drawn, slots))
-                else:
+                elif contradicts:
                     checked.add("replay", "open", "not played, as the file contradicts itself")
-                if policy_share is not None and not contradicts:
-                    asyncio.run(_play("policies", play_them, archive, checked, policy_share, drawn, slots))
+                for kind, play, part in (
+                    ("replay", replays.replay, share),
+                    ("policies", play_policies, policy_share),
+                ):
+                    if part is not None and not contradicts:
+                        partial = functools.partial(play, archive, checked, part, drawn, slots)
+                        asyncio.run(_play(kind, partial))
         except ProtocolError as error:
             raise ConfigError(f"{file}: {error}") from error
         except OSError as error:
             raise ConfigError(f"{file}: {error.strerror or error}") from error
     if as_json:
-        shown = ("signer", "findings", "claims", "covered", "listing", "removed")
-        found = {name: getattr(checked, name) for name in shown}
-        result = {"file": str(file), "ok": not checked.failed, **found}
-        say_json(result)
+        names = ("signer", "findings", "claims", "covered", "listing", "removed")
+        shown = {name: getattr(checked, name) for name in names}
+        say_json({"file": str(file), "ok": not checked.failed, **shown})
     else:
         _print(checked)
     replayed = share is None or not (
@@ -231,63 +223,39 @@ def _noted(text: str) -> str | Countersignature:
         fail(f"--head {text!r} is neither 64 hexadecimal digits nor a countersignature's file: {error}")
 
 
-async def _play(
-    what: str,
-    play: Callable[..., Awaitable[None]],
-    archive: Archive,
-    checked: Checked,
-    share: float,
-    seed: int,
-    slots: int,
-) -> None:
+async def _play(kind: str, play: Callable[[replays.Tell], Awaitable[None]]) -> None:
     end_on_sigterm()
-    console = terminal(stderr=True)
-    with console.status(what) as status:
-
-        def tell(played: int, total: int) -> None:
-            status.update(f"{what}: {played} of {total} episodes")
-
-        await play(archive, checked, share, seed, slots, tell)
+    with terminal(stderr=True).status(kind) as status:
+        await play(lambda played, total: status.update(f"{kind}: {played} of {total} episodes"))
 
 
 def _print(checked: Checked) -> None:
-    """One page: a line a kind; where something fails or cannot be shown, what and where."""
+    """One page: a line for each kind that is `ok`, and one for each text of the others."""
     marks = {"ok": "ok    ", "open": "open  ", "failed": "FAILED"}
+    grouped = checked.grouped()
     for kind, meaning in KINDS.items():
-        of_kind = [each for each in checked.findings if each.kind == kind]
-        if not of_kind:
-            continue
+        of_kind = [(state, text, by) for (of, state, text), by in grouped.items() if of == kind]
         for state in ("failed", "open"):
-            lines: dict[str, list[str]] = {}
-            for each in of_kind:
-                if each.state == state:
-                    lines.setdefault(each.text, []).append(each.run)
-            texts = []
-            for text, named in lines.items():
-                where = f" [{named[0] if len(named) == 1 else f'{len(named)} runs'}]" if named[0] else ""
-                texts.append(f"{text}{where}")
+            texts = [f"{text} [{by}]" if by else text for each, text, by in of_kind if each == state]
             for text in first(texts):
                 say(one_line(f"{marks[state]} {kind}: {text}"))
-        if all(each.state == "ok" for each in of_kind):
-            n = len({each.run for each in of_kind if each.run})
-            say(
-                one_line(
-                    f"{marks['ok']} {kind}: " + (f"{meaning} ({counted(n, 'run')})" if n else of_kind[0].text)
-                )
-            )
+        if of_kind and all(state == "ok" for state, *_ in of_kind):
+            n = len({each.run for each in checked.findings if each.kind == kind and each.run})
+            text = f"{meaning} ({counted(n, 'run')})" if n else of_kind[0][1]
+            say(one_line(f"{marks['ok']} {kind}: {text}"))
     if checked.covered:
         say(f"the replay covered {checked.coverage()} episodes")
     _say_left_out([each for each in checked.listing if each.state != "published"])
-    shown = "nothing in this file contradicts itself"
+    verdict = "nothing in this file contradicts itself"
     if checked.failed:
-        shown = "something in this file contradicts itself or what you expect"
+        verdict = "something in this file contradicts itself or what you expect"
     if without := sum(bool(checked.unrecorded(run)) for run in checked.recorded):
-        shown += (
+        verdict += (
             f"; {without} of {len(checked.recorded)} runs have episodes without a recording, which no replay can"
             " confirm"
         )
-    known = checked.state_of("identity") == "ok"
-    say(f"verdict: {shown}; " + ("the signer is the one that you named" if known else "self-signed"))
+    is_known = checked.state_of("identity") == "ok"
+    say(f"verdict: {verdict}; " + ("the signer is the one that you named" if is_known else "self-signed"))
 
 
 def _say_left_out(listed: Sequence[Listed]) -> None:

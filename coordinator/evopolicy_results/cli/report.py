@@ -1,8 +1,6 @@
 """`evopolicy report`: run directories in, a folder with the report out.
 
-It reads hidden scores, so it comes with the coordinator's extra. Needs no coordinator, worker or simulator. Exit codes:
-0 written, 1 no complete run among what was given or a disk that refuses, 2 wrong usage, 3 the runs are no fair
-comparison.
+It reads hidden scores, so it comes with the coordinator's extra. Needs no coordinator, worker or simulator.
 """
 
 from __future__ import annotations
@@ -14,11 +12,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
-from evopolicy_common.cli.conventions import code_of, fail
+from evopolicy_common.cli.conventions import Json, code_of, fail
 from evopolicy_common.cli.frame import App
-from evopolicy_common.console import terminal
+from evopolicy_common.console import progress_bars, terminal
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.processes.preflight import check_writable
 from evopolicy_common.records.rescores import is_name
@@ -47,11 +44,8 @@ def report(
     runs: Annotated[
         list[Path],
         typer.Argument(
-            help=(
-                "Run directories, or folders that contain them. A CSV of held-out returns"
-                " (entry,harness,<environment>,…) adds "
-                "entries without runs."
-            ),
+            help="Run directories, or folders that contain them. A CSV of held-out returns"
+            " (entry,harness,<environment>,…) adds entries without runs."
         ),
     ],
     out: Annotated[Path, typer.Option(help="Folder to write; a new one, or an earlier report's.")],
@@ -67,11 +61,8 @@ def report(
         bool,
         typer.Option(
             "--allow-mixed",
-            help=(
-                "Compare runs with different budgets, policy scopes, splits, fingerprints, jails or hidden isolation;"
-                " the report "
-                "says so."
-            ),
+            help="Compare runs with different budgets, policy scopes, splits, fingerprints, jails or hidden isolation;"
+            " the report says so.",
         ),
     ] = False,
     allow_unknown: Annotated[
@@ -88,9 +79,7 @@ def report(
         ),
     ] = True,
     jobs: Annotated[int, typer.Option(min=0, help="Number of processes; 0: one for each core.")] = 0,
-    as_json: Annotated[
-        bool, typer.Option("--json", help="Print the written files and the excluded runs as JSON.")
-    ] = False,
+    as_json: Json = False,
 ) -> None:
     """Write a report on finished runs: leaderboard, figures and diagnostics."""
     try:
@@ -108,13 +97,11 @@ def report(
                         study, out, title=title, traces=pages, processes=processes, progress=tell
                     )
     except MixedRunsError as error:
+        kinds = [one.what for one in error.mixtures]
         options = sorted(
-            {
-                "--allow-unknown" if one.what == UNKNOWN_ISOLATION else "--allow-mixed"
-                for one in error.mixtures
-            }
+            {"--allow-unknown" if kind == UNKNOWN_ISOLATION else "--allow-mixed" for kind in kinds}
         )
-        same = dict.fromkeys(REMEDIES[one.what] for one in error.mixtures if one.what in REMEDIES)
+        same = dict.fromkeys(REMEDIES[kind] for kind in kinds if kind in REMEDIES)
         advice = [f"Runs compare that were played with {'; '.join(same)}."] if same else []
         say_lines([f"error: {error}".splitlines()[0], *str(error).splitlines()[1:], *advice], err=True)
         say(
@@ -124,22 +111,17 @@ def report(
         raise SystemExit(MIXED) from error
     except ConfigError as error:
         fail(str(error), code_of(error))
-    if unknown := sum(
-        run.record.hidden_isolation == "unknown" and not run.is_published for run in study.runs
-    ):
+    old = [run for run in study.runs if run.record.hidden_isolation == "unknown" and not run.is_published]
+    if old:
         say(
-            f"warning: {unknown} of {len(study.runs)} runs do not tell whether hidden episodes and agents shared a"
+            f"warning: {len(old)} of {len(study.runs)} runs do not tell whether hidden episodes and agents shared a"
             " kernel; they are from before it was recorded",
             err=True,
         )
     if as_json:
         left_out = [{"path": str(item.path), "reason": item.reason} for item in study.left_out]
-        found = {
-            "index": str(index) if index is not None else None,
-            "runs": len(study.runs),
-            "left_out": left_out,
-        }
-        say_json(found, indent=False)
+        place = str(index) if index is not None else None
+        say_json({"index": place, "runs": len(study.runs), "left_out": left_out}, indent=False)
     else:
         say_lines((f"left out: {item.path}: {item.reason}" for item in study.left_out), err=True)
         if index is not None:
@@ -163,21 +145,21 @@ def _study(
     tables = [path for path in paths if path.suffix == ".csv" and path.is_file()]
     if len(tables) > 1:
         raise ConfigError(f"one CSV of held-out returns at most, not {len(tables)}")
+    if rescore and not is_name(rescore):
+        raise ConfigError(
+            f"--scores {rescore!r} cannot be the name of a re-score: use letters, digits, '.', '_' and '-'"
+        )
     loaded = load_runs(
         [path for path in paths if path not in tables],
         processes=processes,
         progress=lambda done, total: tell("runs read", done, total),
     )
-    if rescore and not is_name(rescore):
-        raise ConfigError(
-            f"--scores {rescore!r} cannot be the name of a re-score: use letters, digits, '.', '_' and '-'"
-        )
     scores = None
-    if tables:
+    for table in tables:
         try:
-            scores = read_score_csv(read_given(tables[0], str(tables[0])).decode(), source=str(tables[0]))
+            scores = read_score_csv(read_given(table, str(table)).decode(), source=str(table))
         except UnicodeDecodeError as error:
-            raise ConfigError(f"{tables[0]} cannot be read: {error}") from error
+            raise ConfigError(f"{table} cannot be read: {error}") from error
     tell("statistics", 0, 1)
     study = study_of(
         rescored(loaded.runs, rescore) if rescore else loaded.runs,
@@ -193,14 +175,12 @@ def _study(
 @contextmanager
 def _progress() -> Iterator[Tell]:
     """A bar for each stage on standard error, when that is a terminal."""
-    console = terminal(stderr=True)
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-    with Progress(*columns, console=console, disable=not console.is_terminal, transient=True) as progress:
+    with progress_bars(terminal(stderr=True)) as progress:
         tasks = {}
 
-        def tell(what: str, done: int, total: int) -> None:
-            if what not in tasks:
-                tasks[what] = progress.add_task(what, total=total)
-            progress.update(tasks[what], completed=done, total=total)
+        def tell(stage: str, done: int, total: int) -> None:
+            if stage not in tasks:
+                tasks[stage] = progress.add_task(stage, total=total)
+            progress.update(tasks[stage], completed=done, total=total)
 
         yield tell

@@ -1,8 +1,4 @@
-"""`evopolicy rescore RUN…`: stored checkpoints on further hidden cases, written beside `run.json`.
-
-Exit codes: 0 every run is re-scored, 1 the cluster failed or refused, 2 wrong usage (also: no run can be re-scored), 3
-some runs are re-scored and others cannot be, 130 Ctrl-C. The same command continues where an interrupted one stopped.
-"""
+"""`evopolicy rescore RUN…`: stored checkpoints on further hidden cases, written beside `run.json`."""
 
 from __future__ import annotations
 
@@ -15,6 +11,7 @@ import typer
 from evopolicy_common.cli.conventions import (
     Connect,
     CredentialsFile,
+    Json,
     end_on_sigterm,
     fail,
     fail_on_our_errors,
@@ -27,7 +24,7 @@ from evopolicy_common.processes.packages import packages_in
 from evopolicy_common.records.rescores import is_name
 from evopolicy_common.records.run_files import no_run_below, run_folders
 from evopolicy_common.terminal import number, one_line, say, say_json
-from evopolicy_results.cli.cluster import Local, Runs, Slots, State, where_of
+from evopolicy_results.cli.cluster import Local, Runs, Slots, State, Where
 from evopolicy_results.rescore.play import Finished, Wanted, Written, read_finished
 from evopolicy_results.rescore.play import rescore as rescore_run
 
@@ -55,8 +52,7 @@ def rescore(
     data: Annotated[
         Path | None,
         typer.Option(
-            help="Take the held-out cases of this folder of split files instead; with --cases, the first"
-            " ones."
+            help="Take the held-out cases of this folder of split files instead; with --cases, the first ones."
         ),
     ] = None,
     all_checkpoints: Annotated[
@@ -75,7 +71,7 @@ def rescore(
     local: Local = False,
     state: State = None,
     slots: Slots = 2,
-    as_json: Annotated[bool, typer.Option("--json", help="Print what was written as JSON.")] = False,
+    as_json: Json = False,
 ) -> None:
     """Play checkpoints of finished runs on further hidden cases, for tighter intervals.
 
@@ -88,17 +84,17 @@ def rescore(
         fail("name the new cases: --cases 256 for their number, or --data FOLDER for split files")
     if data is not None and not data.is_dir():
         fail(f"--data {data} is not a folder")
-    where = where_of(connect, file, local, state, runs=runs)
+    where = Where(connect, file, local, state, runs=runs)
     chosen = name or (f"cases-{cases}" if data is None else re.sub(r"[^A-Za-z0-9._-]+", "-", data.name))
     if not is_name(chosen):
         fail(f"--name {chosen!r}: letters, digits, '.', '_' and '-', at most 64, the first a letter or digit")
     wanted = Wanted(name=chosen, n_cases=cases, data=data, every=all_checkpoints)
     console = terminal(stderr=as_json)
     with fail_on_our_errors():
-        found, empty = run_folders(runs)
+        folders, empty = run_folders(runs)
         if empty:
             raise ConfigError(no_run_below(empty[0]))
-        finished, without, failed = read_finished(found)
+        finished, without, failed = read_finished(folders)
         for text in without:
             say(f"left out: {one_line(text)}", err=True)
         if not finished:
@@ -108,7 +104,7 @@ def rescore(
         async def work() -> None:
             end_on_sigterm()
             packages = _packages(finished) if local else ()
-            async with where.playing("rescore", console, packages=packages) as playing:
+            async with where.playing("rescore", console, packages) as playing:
 
                 async def play() -> None:
                     for run in finished:
@@ -149,13 +145,12 @@ def rescore(
 def _packages(runs: list[Finished]) -> tuple[str, ...]:
     """Packages besides numpy that the runs' policies import. Raises ConfigError where they differ, since a cluster
     offers one set of packages."""
-    found = {packages_in(run.record.versions.fingerprint): run.folder for run in runs}
-    if len(found) > 1:
-        listed = "; ".join(
-            f"{folder}: {', '.join(names) or 'none'}" for names, folder in sorted(found.items())
-        )
+    packages = {packages_in(run.record.versions.fingerprint): run.folder for run in runs}
+    if len(packages) > 1:
+        each = sorted(packages.items())
+        listed = "; ".join(f"{folder}: {', '.join(names) or 'none'}" for names, folder in each)
         raise ConfigError(
             f"policies of these runs import different packages ({listed}): re-score runs with the same packages at a"
             " time"
         )
-    return next(iter(found))
+    return next(iter(packages))

@@ -1,12 +1,9 @@
-"""`evopolicy verify RUN_DIR`: a finished run's episodes played again, and what differs.
-
-Exit codes: 0 all that was played again is identical, 1 something differs, 2 wrong usage (also: other cases than the
-run's), 3 it could not be checked, or not all of it (the cluster cannot be reached, refused, or has removed episodes).
-"""
+"""`evopolicy verify RUN_DIR`: a finished run's episodes played again, and their differences."""
 
 from __future__ import annotations
 
 import random
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -16,6 +13,7 @@ from evopolicy_common.cli.conventions import (
     CLUSTER,
     Connect,
     CredentialsFile,
+    Json,
     end_on_sigterm,
     fail,
     fail_on_our_errors,
@@ -27,9 +25,9 @@ from evopolicy_common.errors import ConfigError, EvopolicyError
 from evopolicy_common.messages.episode import Tier
 from evopolicy_common.processes.packages import packages_in
 from evopolicy_common.terminal import one_line, say_json
-from evopolicy_results.cli.cluster import Local, Slots, State, first, where_of
+from evopolicy_results.cli.cluster import Local, Slots, State, Where, first
 from evopolicy_results.evaluations import sample as draw
-from evopolicy_results.verify.run import Finding, Report, Verifier
+from evopolicy_results.verify.run import Difference, Report, Verifier
 from evopolicy_results.verify.source import read_run
 
 DIFFERS, USAGE, UNCHECKED = 1, 2, 3
@@ -69,7 +67,7 @@ def verify(
             help="Also play the checkpoints' policies again; their differences are advisory.",
         ),
     ] = True,
-    as_json: Annotated[bool, typer.Option("--json", help="Print the report as JSON.")] = False,
+    as_json: Json = False,
 ) -> None:
     """Replay a run's recorded actions, and compare rewards, observations and returns bit for bit.
 
@@ -79,17 +77,17 @@ def verify(
     differs, 2 wrong usage or other cases than the run's, 3 could not be checked, or not all of it.
     """
     seed = random.SystemRandom().randrange(2**32) if seed is None else seed
-    where = where_of(connect, file, local, state, data, runs=[run])
+    where = Where(connect, file, local, state, data, runs=[run], needs_state=False)
     console = terminal(stderr=as_json)
 
     async def work() -> Report:
         end_on_sigterm()
-        found = read_run(run)
-        packages = packages_in(found.record.versions.fingerprint)
-        async with where.playing("verify", console, needs_state=False, packages=packages) as playing:
-            verifier = Verifier(playing.evaluations, found, tier)
+        finished = read_run(run)
+        packages = packages_in(finished.record.versions.fingerprint)
+        async with where.playing("verify", console, packages) as playing:
+            verifier = Verifier(playing.evaluations, finished, tier)
             knows_run = await verifier.check_cases()
-            lists = [*found.train, *(found.hidden if knows_run else ())]
+            lists = [*finished.train, *(finished.hidden if knows_run else ())]
             sizes = [len(played.env_instances) for played in lists]
             chosen = [(lists[k], indexes) for k, indexes in draw(sizes, sample or sum(sizes), seed)]
             if not chosen:
@@ -113,7 +111,8 @@ def verify(
                         await verifier.play_policy(played, indexes)
                 await verifier.check_fingerprint()
 
-            await playing.play([found.record.env], {tier or found.record.sandbox_tier}, slots, play)
+            tiers = {tier or finished.record.sandbox_tier}
+            await playing.play([finished.record.env], tiers, slots, play)
         return verifier.report
 
     with fail_on_our_errors():
@@ -134,26 +133,22 @@ def _print(report: Report, console: Terminal) -> None:
     def say(text: str) -> None:
         console.print(one_line(text), soft_wrap=True)
 
-    def listed(heading: str, lines: list[str]) -> None:
-        for line in [heading, *(f"  {each}" for each in first(lines))] if lines else ():
+    def listed(heading: str, lines: Sequence[str | Difference]) -> None:
+        texts = [each if isinstance(each, str) else f"{each.episode}: {each.difference}" for each in lines]
+        for line in [heading, *(f"  {each}" for each in first(texts))] if texts else ():
             say(line)
-
-    def texts(findings: list[Finding]) -> list[str]:
-        return [f"{one.episode}: {one.difference}" for one in findings]
 
     for note in report.notes:
         say(f"note: {note}")
     listed("library versions differ:", report.fingerprint_differences)
-    listed("not checked:", texts(report.not_checked))
-    listed("differs:", texts(report.differences))
+    listed("not checked:", report.not_checked)
+    listed("differs:", report.differences)
     source = f", {report.from_files} of them from feedback files" if report.from_files else ""
     verdict = "identical" if report.identical else "NOT identical"
     unchecked = report.unchecked_episodes
     rest = f"; {unchecked} further episodes could not be checked" if unchecked else ""
     say(f"{report.env}: recorded actions of {report.episodes} episodes{source}: {verdict}{rest}")
-    if report.policy_episodes:
-        others = len(report.policy_differences)
-        listed("policy again, advisory:", texts(report.policy_differences))
-        say(
-            f"policy again (advisory): {report.policy_episodes - others} of {report.policy_episodes} episodes the same"
-        )
+    if total := report.policy_episodes:
+        listed("policy again, advisory:", report.policy_differences)
+        same = total - len(report.policy_differences)
+        say(f"policy again (advisory): {same} of {total} episodes the same")

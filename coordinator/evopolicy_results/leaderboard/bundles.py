@@ -12,7 +12,8 @@ Rules that this module owns:
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Sequence
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +29,6 @@ from evopolicy_results.publish import contents, rules, run_rules
 from evopolicy_results.publish.archive import Archive
 from evopolicy_results.publish.contents import Episode
 from evopolicy_results.publish.findings import Checked, PublishedRun
-from evopolicy_results.publish.scan import scan_published
 from evopolicy_results.reading.comparability import mixtures
 from evopolicy_results.reading.reader import load_runs
 from evopolicy_results.reading.records import LeftOut, Run
@@ -69,9 +69,14 @@ class LabBundle(msgspec.Struct, kw_only=True):
     """Runs of the file that a report leaves out, with the reason."""
     refused: str = ""
     """Why no run of it is shown; empty when they are."""
-    processors: list[str] = []
     heads: list[str] = []
     """Of its journal, after each entry."""
+
+    @property
+    def processors(self) -> list[str]:
+        runs = () if self.refused else self.checked.runs
+        cpus = (run.record.versions.fingerprint.get("cpu", "") for run in runs)
+        return [each for each in dict.fromkeys(cpus) if each]
 
     @property
     def page(self) -> str:
@@ -93,57 +98,46 @@ def read_bundles(
 ) -> list[LabBundle]:
     """Checks all files and unpacks their runs below `folder`. `labs`: public key (hex) to the signer's name, empty for
     none."""
-    found: list[LabBundle] = []
+    bundles = [LabBundle(file=path.name, sha256=_sha256(path), number=n) for n, path in enumerate(files)]
     seen: dict[tuple[str, str], str] = {}
-    for number, path in enumerate(files):
-        bundle = LabBundle(file=path.name, sha256=_sha256(path), number=number)
-        found.append(bundle)
+    for bundle, path in zip(bundles, files, strict=True):
         try:
             with Archive(path) as archive:
-                _read(archive, bundle, labs, folder / f"{number:04d}", seen, replay)
+                bundle.checked = checked = rules.check(archive)
+                if checked.signer in labs:
+                    # The whole check again costs more than to replace its one finding on the signer.
+                    checked.findings = [each for each in checked.findings if each.kind != "identity"]
+                    checked.add("identity", "ok", "signed by a key that the site's owner named")
+                    bundle.lab = labs[checked.signer]
+                run_rules.scan_published(archive, checked)
+                if not checked.failed:
+                    replay(archive, checked)
+                bundle.refused = _refusal(checked, seen)
+                if not bundle.refused:
+                    seen |= {(checked.signer, run.opening.run): bundle.file for run in checked.runs}
+                    _read_runs(archive, bundle, folder.resolve() / f"{bundle.number:04d}")
         except ProtocolError as error:
             bundle.refused = str(error)
-    _compare_journals(found)
-    _tell_apart(found)
-    return found
+    _compare_journals(bundles)
+    _tell_apart(bundles)
+    return bundles
 
 
-def _read(
-    archive: Archive,
-    bundle: LabBundle,
-    labs: dict[str, str],
-    folder: Path,
-    seen: dict[tuple[str, str], str],
-    replay: Replay,
-) -> None:
-    checked = rules.check(archive)
-    if checked.signer in labs:
-        # The whole check again costs more than to replace its one finding on the signer.
-        checked.findings = [each for each in checked.findings if each.kind != "identity"]
-        checked.add("identity", "ok", "signed by a key that the site's owner named")
-        bundle.lab = labs[checked.signer]
-    scan_published(archive, checked)
-    bundle.checked = checked
-    if not checked.failed:
-        replay(archive, checked)
-    if checked.failed:
-        bundle.refused = "; ".join(
-            dict.fromkeys(f"{each.kind}: {each.text}" for each in checked.findings if each.state == "failed")
-        )[:500]
-        return
-    for run in checked.runs:
-        if before := seen.get((checked.signer, run.opening.run)):
-            bundle.refused = f"run {run.opening.run} is also in {before}"
-            return
+def _refusal(checked: Checked, seen: Mapping[tuple[str, str], str]) -> str:
+    """Why a file is not shown; empty if it is. `seen`: the file of each signer's runs."""
+    failed = [f"{each.kind}: {each.text}" for each in checked.findings if each.state == "failed"]
+    runs = [run.opening.run for run in checked.runs]
+    repeated = [f"run {run} is also in {file}" for run in runs if (file := seen.get((checked.signer, run)))]
+    return "; ".join(dict.fromkeys(failed))[:500] or next(iter(repeated), "")
+
+
+def _read_runs(archive: Archive, bundle: LabBundle, folder: Path) -> None:
+    """Unpacks the runs below `folder`, and reads them as a report does."""
     lines = contents.journal_entries(archive.read(contents.JOURNAL, contents.MAX_RECORDING_BYTES))
     bundle.heads = journal.heads(lines)
-    folder = folder.resolve()
-    by_folder = {folder / run.folder: run for run in checked.runs}
+    by_folder = {folder / run.folder: run for run in bundle.checked.runs}
     for place, run in by_folder.items():
-        seen[checked.signer, run.opening.run] = bundle.file
         _unpack(archive, run, place)
-    cpus = (run.record.versions.fingerprint.get("cpu", "") for run in checked.runs)
-    bundle.processors = [each for each in dict.fromkeys(cpus) if each]
     loaded = load_runs([folder])
     bundle.left_out = [
         msgspec.structs.replace(each, path=each.path.relative_to(folder))
@@ -156,7 +150,7 @@ def _read(
             run=each,
             published=run.opening.run,
             episodes=_curves(archive, run),
-            unrecorded=bool(checked.unrecorded(run.opening.run)),
+            unrecorded=bool(bundle.checked.unrecorded(run.opening.run)),
         )
         for each in loaded.runs
         for run in (by_folder[each.path],)
@@ -168,9 +162,8 @@ def _read(
 def _unpack(archive: Archive, run: PublishedRun, place: Path) -> None:
     """Writes `run.json` and the checkpoints as a run directory."""
     place.mkdir(parents=True)
-    replace, record = msgspec.structs.replace, run.record
+    replace, record, agent = msgspec.structs.replace, run.record, run.record.agent
     fingerprint = {name: each for name, each in record.versions.fingerprint.items() if name != "cpu"}
-    agent = record.agent
     kept = replace(
         record,
         exp_id=_short(record.exp_id),
@@ -181,17 +174,17 @@ def _unpack(archive: Archive, run: PublishedRun, place: Path) -> None:
         replays=(),
     )
     (place / "run.json").write_bytes(encode_run_record(kept))
-    left = run.opening.budget
-    policies = dict(run.bundles(archive))
+    budget = run.opening.budget
+    policies = run.bundles(archive)
     for submit in run.result.submits:
-        before, left = left, left - len(submit.env_instances)
+        before, budget = budget, budget - len(submit.env_instances)
         bundle = policies.get(submit.submit_index)
         meta = CheckpointMeta(
             submit_index=submit.submit_index,
             submit_time="",
             n_episodes_requested=len(submit.env_instances),
             remaining_budget_before=before,
-            remaining_budget_after=left,
+            remaining_budget_after=budget,
             validation_status=submit.status,
             mean_return=submit.mean_return,
             val_mean=submit.val_mean,
@@ -201,30 +194,28 @@ def _unpack(archive: Archive, run: PublishedRun, place: Path) -> None:
 
 
 def _curves(archive: Archive, run: PublishedRun) -> tuple[tuple[Episode, tuple[float, ...]], ...]:
-    best = run.result.best_submit_index
-    group = next((each for each in run.groups if each.split == "heldout" and each.submit_index == best), None)
-    if group is None:
-        return ()
-    recordings = dict(enumerate(run.recordings(archive, group.name)))
-    found = []
-    for episode in group.episodes:
-        sums = np.zeros(0)
-        if (data := recordings.get(episode.index)) is not None:
-            sums = np.cumsum([0.0, *run_rules.recording_of(data).rewards.tolist()])
-        step = max(1, -(-len(sums) // _POINTS))
-        found.append((episode, (*sums[:-1:step].tolist(), *sums[-1:].tolist())))
-    return tuple(found)
+    place = ("heldout", run.result.best_submit_index)
+    episodes = []
+    for group in (each for each in run.groups if (each.split, each.submit_index) == place):
+        recordings = dict(enumerate(run.recordings(archive, group.name)))
+        for episode in group.episodes:
+            sums = np.zeros(0)
+            if (data := recordings.get(episode.index)) is not None:
+                sums = np.cumsum([0.0, *run_rules.recording_of(data).rewards.tolist()])
+            step = max(1, -(-len(sums) // _POINTS))
+            episodes.append((episode, (*sums[:-1:step].tolist(), *sums[-1:].tolist())))
+    return tuple(episodes)
 
 
-def _compare_journals(found: Sequence[LabBundle]) -> None:
+def _compare_journals(bundles: Sequence[LabBundle]) -> None:
     """Reports files whose journal is not the beginning of the longest one of their signer."""
     longest: dict[str, LabBundle] = {}
-    for bundle in found:
+    for bundle in bundles:
         if bundle.heads and len(bundle.heads) > len(longest.setdefault(bundle.signer, bundle).heads):
             longest[bundle.signer] = bundle
-    for bundle in found:
-        n, other = len(bundle.heads), longest.get(bundle.signer)
-        if n and other is not None and other.heads[n - 1] != bundle.heads[-1]:
+    for bundle in (each for each in bundles if each.heads):
+        n, other = len(bundle.heads), longest[bundle.signer]
+        if other.heads[n - 1] != bundle.heads[-1]:
             for one, another in ((bundle, other), (other, bundle)):
                 text = (
                     f"the first {n} entries are others in {another.file} of the same signer: one journal was begun"
@@ -233,22 +224,22 @@ def _compare_journals(found: Sequence[LabBundle]) -> None:
                 one.checked.add("order", "failed", text)
 
 
-def _tell_apart(found: Sequence[LabBundle]) -> None:
+def _tell_apart(bundles: Sequence[LabBundle]) -> None:
     """Adds the signer to entries that several signers have, until none is shared: a signer may have chosen the name
     that another's entry gets. Of a signer's runs with one name, the later ones get their ids."""
-    names = [bundle.label for bundle in found]
-    while shared := _shared(found):
-        for bundle, name in zip(found, names, strict=True):
+    names = [bundle.label for bundle in bundles]
+    while shared := _shared(bundles):
+        for bundle, name in zip(bundles, names, strict=True):
             for number, each in enumerate(bundle.runs):
                 agent = each.run.record.agent
                 if agent.entry in shared:
                     new = msgspec.structs.replace(agent, entry=f"{agent.entry} ({name})")
                     bundle.runs[number] = _with(each, agent=new)
         # Names and first digits may be equal; whole keys are not.
-        names = [bundle.signer for bundle in found]
+        names = [bundle.signer for bundle in bundles]
     # A report knows a run by its name, so two files of one signer may not have the same one.
     seen: set[str] = set()
-    for bundle in found:
+    for bundle in bundles:
         for number, each in enumerate(bundle.runs):
             while each.run.name in seen:
                 each = _with(each, exp_id=f"{each.run.record.exp_id} ({each.published})")
@@ -262,13 +253,10 @@ def _with(each: LabRun, **changes: Any) -> LabRun:
     return msgspec.structs.replace(each, run=msgspec.structs.replace(each.run, record=record))
 
 
-def _shared(found: Sequence[LabBundle]) -> set[str]:
+def _shared(bundles: Sequence[LabBundle]) -> set[str]:
     """Entries that several signers have."""
-    signers: dict[str, set[str]] = {}
-    for bundle in found:
-        for each in bundle.runs:
-            signers.setdefault(each.run.entry, set()).add(bundle.signer)
-    return {entry for entry, keys in signers.items() if len(keys) > 1}
+    pairs = {(each.run.entry, bundle.signer) for bundle in bundles for each in bundle.runs}
+    return {entry for entry, n in Counter(entry for entry, _ in pairs).items() if n > 1}
 
 
 def _short(text: str) -> str:
@@ -290,7 +278,7 @@ class Board(msgspec.Struct, kw_only=True):
     apart: list[str] = []
     """How its runs differ from those of the first board; empty for the first board."""
     mixed: bool = False
-    """A single bundle whose own runs are no one comparison."""
+    """Whether its runs, of a single bundle, are no one comparison."""
     unrecorded: bool = False
     """Its runs have episodes without a recording."""
 
@@ -302,7 +290,7 @@ class Board(msgspec.Struct, kw_only=True):
 def boards(bundles: Sequence[LabBundle]) -> list[Board]:
     """The boards, the one with most runs first. A bundle joins the first board that it is comparable with. Its runs
     with episodes that have no recording stand on boards of their own, after the others."""
-    found: list[Board] = []
+    all_boards: list[Board] = []
     parts = [
         (unrecorded, msgspec.structs.replace(bundle, runs=runs))
         for bundle in bundles
@@ -310,23 +298,21 @@ def boards(bundles: Sequence[LabBundle]) -> list[Board]:
         if not bundle.refused and (runs := [one for one in bundle.runs if one.unrecorded == unrecorded])
     ]
     for unrecorded, bundle in sorted(parts, key=lambda part: (-len(part[1].runs), part[1].file)):
-        own = [each.run for each in bundle.runs]
-        if mixtures(own):
-            found.append(Board(bundles=[bundle], mixed=True, unrecorded=unrecorded))
-            continue
-        alike = [board for board in found if not board.mixed and board.unrecorded == unrecorded]
-        home = next((board for board in alike if not mixtures([*board.runs, *own])), None)
-        if home is None:
-            found.append(Board(bundles=[bundle], unrecorded=unrecorded))
-        else:
+        board = Board(bundles=[bundle], unrecorded=unrecorded)
+        board.mixed = bool(mixtures(board.runs))
+        others = [one for one in all_boards if not one.mixed and one.unrecorded == unrecorded]
+        alike = (one for one in others if not mixtures([*one.runs, *board.runs]))
+        if not board.mixed and (home := next(alike, None)):
             home.bundles.append(bundle)
-    found.sort(key=lambda board: (board.unrecorded, board.mixed, -len(board.runs)))
-    for board in found:
+        else:
+            all_boards.append(board)
+    all_boards.sort(key=lambda board: (board.unrecorded, board.mixed, -len(board.runs)))
+    for board in all_boards:
         if board.unrecorded:
             board.apart.append(
                 "some of their episodes have no recording, so that no replay can contradict the returns"
             )
-        if board is not found[0]:
-            whole = board.runs if board.mixed else [*found[0].runs, *board.runs]
+        if board is not all_boards[0]:
+            whole = board.runs if board.mixed else [*all_boards[0].runs, *board.runs]
             board.apart += [str(one) for one in mixtures(whole)]
-    return found
+    return all_boards

@@ -13,7 +13,7 @@ from typing import Annotated
 
 import typer
 
-from evopolicy_common.cli.conventions import fail, fail_on_our_errors
+from evopolicy_common.cli.conventions import Json, fail, fail_on_our_errors
 from evopolicy_common.cli.frame import App
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.processes.preflight import check_writable
@@ -57,9 +57,7 @@ def leaderboard(
         int, typer.Option(min=1, max=1024, help="With --replay: episodes at the same time.")
     ] = 2,
     title: Annotated[str, typer.Option(help="Heading of the site.")] = "Leaderboard",
-    as_json: Annotated[
-        bool, typer.Option("--json", help="Print the listed and the rejected files as JSON.")
-    ] = False,
+    as_json: Json = False,
 ) -> None:
     """Write a leaderboard of several labs' published results as a static site.
 
@@ -99,10 +97,10 @@ def leaderboard(
             raise ConfigError(f"{error.filename}: {error.strerror}") from error
         shown = [bundle for bundle in bundles if not bundle.refused]
         index = write_site(bundles, out, title=title, tell=lambda text: say(one_line(text), err=True))
-        told = ("file", "signer", "lab", "runs", "refused")
-        found = [{name: getattr(one, name) for name in told} | {"runs": len(one.runs)} for one in bundles]
     if as_json:
-        say_json({"index": str(index), "files": found})
+        names = ("file", "signer", "lab", "runs", "refused")
+        told = [{name: getattr(one, name) for name in names} | {"runs": len(one.runs)} for one in bundles]
+        say_json({"index": str(index), "files": told})
     else:
         for one in bundles:
             if one.refused:

@@ -3,8 +3,8 @@
 Rules that this module owns:
 - Files are stored without compression, so unpacking never increases the size. Names are plain: lower-case letters,
   digits, `.`, `-`, `_`, folders by `/`. No links, no comments, no extra fields, no zip64, no duplicates, no gaps.
-- The reader parses the archive itself, and refuses every archive that the writer could not have made before it reads
-  content. It holds the names and one file at a time in memory.
+- Names, sizes and checksums determine all other bytes of the archive. The reader refuses any other bytes before it
+  reads content. It holds the names and one file at a time in memory.
 """
 
 from __future__ import annotations
@@ -13,7 +13,6 @@ import re
 import struct
 import zipfile
 import zlib
-from collections import namedtuple
 from pathlib import Path
 from typing import BinaryIO
 
@@ -26,11 +25,6 @@ _MAX_NAME = 120
 _NAME = re.compile(r"[a-z0-9_][a-z0-9._-]*(/[a-z0-9_][a-z0-9._-]*){0,4}")
 _END = struct.Struct("<4sHHHHIIH")
 _ENTRY = struct.Struct("<4sHHHHHHIIIHHHHHII")
-_Entry = namedtuple(
-    "_Entry",
-    "mark made needs flags method time date crc packed length n_name n_extra n_comment part internal mode"
-    " offset",
-)
 _LOCAL = struct.Struct("<4sHHHHHIIIHH")
 _FILE_MODE = 0o100644
 
@@ -40,6 +34,7 @@ class Writer:
 
     def __init__(self, path: Path) -> None:
         self._zip = zipfile.ZipFile(path, "w", zipfile.ZIP_STORED, allowZip64=False)
+        self.close = self._zip.close
 
     def add(self, name: str, data: bytes) -> None:
         """Adds a file. ProtocolError for a name that the reader would refuse."""
@@ -49,15 +44,19 @@ class Writer:
         info.external_attr = _FILE_MODE << 16
         self._zip.writestr(info, data)
 
-    def close(self) -> None:
-        self._zip.close()
+
+def _headers(name: bytes, crc: int, size: int, offset: int) -> tuple[bytes, bytes]:
+    """The bytes before a file's content at `offset`, and those in the list at the end, as `Writer` makes them."""
+    common = (20, 0, 0, 0, 1 << 5 | 1, crc, size, size, len(name), 0)
+    entry = _ENTRY.pack(b"PK\1\2", 3 << 8 | 20, *common, 0, 0, 0, _FILE_MODE << 16, offset)
+    return _LOCAL.pack(b"PK\3\4", *common) + name, entry + name
 
 
 class Archive:
-    """An archive that was looked through as a whole: its names are known, its files can be read."""
+    """An archive whose headers were checked as a whole."""
 
     def __init__(self, path: Path) -> None:
-        """ProtocolError naming the first thing that is not as it should be; OSError when the file cannot be read."""
+        """ProtocolError naming the first fault; OSError when the file cannot be read."""
         self._file: BinaryIO = open_regular(path, links=True)
         try:
             self._places = _places(self._file)
@@ -99,44 +98,39 @@ def _places(file: BinaryIO) -> dict[str, tuple[int, int, int]]:
     if total < _END.size:
         raise ProtocolError("not published results: too short")
     file.seek(total - _END.size)
-    magic, disk, first_disk, n_here, n, size, start, comment = _END.unpack(file.read(_END.size))
-    if magic != b"PK\5\6" or comment:
+    mark, *parts, n, size, start, comment = _END.unpack(file.read(_END.size))
+    if mark != b"PK\5\6" or comment:
         raise ProtocolError("not published results: no whole file of `evopolicy publish`")
-    if disk or first_disk or n_here != n or n > MAX_FILES:
+    if parts != [0, 0, n] or n > MAX_FILES:
         raise ProtocolError(f"{n} files, {MAX_FILES:,} are allowed, in one part")
     if start + size != total - _END.size or size > n * (_ENTRY.size + _MAX_NAME):
         raise ProtocolError("its list of files is not where it should be")
     file.seek(start)
     listed = file.read(size)
     places: dict[str, tuple[int, int, int]] = {}
-    at, expected = 0, 0
+    at, offset = 0, 0
     for _ in range(n):
         if at + _ENTRY.size > len(listed):
             raise ProtocolError("its list of files is cut off")
-        each = _Entry._make(_ENTRY.unpack_from(listed, at))
-        raw = listed[at + _ENTRY.size : at + _ENTRY.size + each.n_name]
-        at += _ENTRY.size + each.n_name
+        crc, _, length, n_name = _ENTRY.unpack_from(listed, at)[7:11]
+        raw = listed[at + _ENTRY.size : at + _ENTRY.size + n_name]
         name = raw.decode("ascii", "backslashreplace")
         _check_name(name)
-        if each.mark != b"PK\1\2" or each.n_extra or each.n_comment or each.part or each.flags:
-            raise ProtocolError(f"{name}: an entry with extras, which published results do not have")
-        if each.made >> 8 != 3 or each.mode != _FILE_MODE << 16:
-            raise ProtocolError(f"{name} is a link, a folder or another special file")
-        if each.method or each.packed != each.length:
-            raise ProtocolError(f"{name} is compressed, which published results never are")
         if name in places:
             raise ProtocolError(f"{name} occurs twice")
-        begin = expected + _LOCAL.size + each.n_name
-        if each.offset != expected or begin + each.length > start:
-            raise ProtocolError(f"{name} overlaps another file, or leaves a gap")
-        file.seek(expected)
-        mark, _, flags, method, _, _, *sizes = _LOCAL.unpack(file.read(_LOCAL.size))
-        same = (each.crc, each.length, each.length, each.n_name, 0) == tuple(sizes)
-        if (mark, flags, method) != (b"PK\3\4", 0, 0) or not same or file.read(each.n_name) != raw:
+        header, entry = _headers(raw, crc, length, offset)
+        if listed[at : at + len(entry)] != entry:
+            raise ProtocolError(
+                f"{name} is not packed as `evopolicy publish` packs it: compressed, a link, with extras, or out of"
+                " order"
+            )
+        file.seek(offset)
+        if file.read(len(header)) != header:
             raise ProtocolError(f"{name}: its two headers differ")
-        places[name] = (begin, each.length, each.crc)
-        expected = begin + each.length
-    if at != len(listed) or expected != start:
+        places[name] = (offset + len(header), length, crc)
+        at += len(entry)
+        offset += len(header) + length
+    if at != len(listed) or offset != start:
         raise ProtocolError("some bytes belong to no file")
     return places
 

@@ -156,9 +156,8 @@ def make(
     cells: dict[tuple[str, str], list[Source]] = {}
     by_entry: dict[str, list[Source]] = {}
     for each in sources:
-        entry = each.record.agent.entry
-        cells.setdefault((each.record.env, entry), []).append(each)
-        by_entry.setdefault(entry, []).append(each)
+        cells.setdefault((each.record.env, each.record.agent.entry), []).append(each)
+        by_entry.setdefault(each.record.agent.entry, []).append(each)
     conditions = _conditions(records)
     scores = [[each.record.outcome.score for each in cell] for cell in cells.values()]
     return Card(
@@ -183,20 +182,17 @@ def make(
 
 
 def _run(source: Source) -> CardRun:
-    record, outcome = source.record, source.record.outcome
+    record, outcome, result = source.record, source.record.outcome, source.result
     return CardRun(
+        **{name: getattr(record, name) for name in ("run", "env", "exp_id", "repeat")},
         folder=source.folder,
-        run=record.run,
         entry=record.agent.entry,
-        env=record.env,
-        exp_id=record.exp_id,
-        repeat=record.repeat,
         status=outcome.status,
         score=outcome.score,
         random=outcome.random_score,
-        heldout_cases=len(source.result.heldout_returns),
-        submits=len(source.result.submits),
-        episodes=source.result.budget_used,
+        heldout_cases=len(result.heldout_returns),
+        submits=len(result.submits),
+        episodes=result.budget_used,
     )
 
 
@@ -210,13 +206,18 @@ def _cell(env: str, entry: str, sources: Sequence[Source]) -> Cell:
         runs.append(RunReturns(score=score, returns=returns, case_set=cases))
     estimate = cell_mean(Sample(entry=entry, env=env, runs=tuple(runs)))
     outcomes = [each.record.outcome for each in sources]
+    scores = [each.score for each in outcomes if each.score is not None]
     random = [each.random_score for each in outcomes if each.random_score is not None]
-    cell = Cell(entry=entry, env=env, runs=len(sources), mean=None, random=mean(random) if random else None)
-    if estimate is None:
-        return msgspec.structs.replace(cell, over="a run has no score")
-    score = mean([each.score for each in outcomes if each.score is not None])
-    over = estimate.reason or estimate.over
-    return msgspec.structs.replace(cell, mean=score, low=estimate.low, high=estimate.high, over=over)
+    return Cell(
+        entry=entry,
+        env=env,
+        runs=len(sources),
+        mean=mean(scores) if estimate else None,
+        low=estimate.low if estimate else None,
+        high=estimate.high if estimate else None,
+        over=estimate.reason or estimate.over if estimate else "a run has no score",
+        random=mean(random) if random else None,
+    )
 
 
 def _agent(entry: str, sources: Sequence[Source]) -> AgentCost:
@@ -240,13 +241,11 @@ def _agent(entry: str, sources: Sequence[Source]) -> AgentCost:
 
 
 def _conditions(records: Sequence[RunRecord]) -> dict[str, dict[str, dict[str, int]]]:
-    found: dict[str, dict[str, Counter[str]]] = {}
+    counts: dict[str, dict[str, Counter[str]]] = {}
     for record in records:
         use, audit, versions = record.agent.model_use, record.audit, record.versions
         settings: dict[str, Any] = msgspec.to_builtins(record.experiment_dimensions)
-        limits = settings.pop("limits") or {}
-        resources = record.agent.resources
-        own = {} if resources is None else msgspec.to_builtins(resources.limits)
+        limits, resources = settings.pop("limits") or {}, record.agent.resources
         entry = catalogue.known(record.env)
         unmetered = "unknown" if record.agent.model_string else "nothing"
         topics: dict[str, dict[str, Any]] = {
@@ -262,7 +261,7 @@ def _conditions(records: Sequence[RunRecord]) -> dict[str, dict[str, dict[str, i
                 "audits": f"{audit.agreed} of {audit.sampled} confirmed" if audit else "none",
             },
             "hardware": {"processor": versions.fingerprint.get("cpu")},
-            "agents' limits": own,
+            "agents' limits": msgspec.to_builtins(resources.limits) if resources else {},
             "software": {**versions.fingerprint, "cpu": None, "episodes repeat": versions.env_deterministic},
             "settings": {**settings, **limits, "protocol": record.protocol_version},
         }
@@ -270,8 +269,8 @@ def _conditions(records: Sequence[RunRecord]) -> dict[str, dict[str, dict[str, i
             for name, value in values.items():
                 if value not in (None, ""):
                     text = value if isinstance(value, str) else msgspec.json.encode(value).decode()
-                    found.setdefault(topic, {}).setdefault(name, Counter())[text] += 1
-    return {topic: {name: dict(n) for name, n in names.items()} for topic, names in found.items()}
+                    counts.setdefault(topic, {}).setdefault(name, Counter())[text] += 1
+    return {topic: {name: dict(n) for name, n in names.items()} for topic, names in counts.items()}
 
 
 def _limits(
@@ -279,21 +278,21 @@ def _limits(
 ) -> tuple[str, ...]:
     """`scores`: of the runs of each cell."""
     values = {name: each for names in conditions.values() for name, each in names.items()}
-    found = [text for name, (good, text) in _LIMITS.items() if values.get(name, {}).keys() - {good}]
+    limits = [text for name, (good, text) in _LIMITS.items() if values.get(name, {}).keys() - {good}]
     if any(len(each) == 1 for each in scores):
-        found.append("Cells of one run compare checkpoints, not agents: the spread between runs is unknown.")
+        limits.append("Cells of one run compare checkpoints, not agents: the spread between runs is unknown.")
     if any(len(each) > 1 == len(set(each)) for each in scores):
-        found.append("All runs of some cells have one score: they may be copies, and intervals too narrow.")
+        limits.append("All runs of some cells have one score: they may be copies, and intervals too narrow.")
     if "agent" in values["tokens counted by"]:
-        found.append("Some token counts are the agent's own: nothing checked them.")
+        limits.append("Some token counts are the agent's own: nothing checked them.")
     if "none" in values["audits"]:
-        found.append("Some runs had no audits: one worker's word stands for each of their episodes.")
-    return (*found, *_ALWAYS)
+        limits.append("Some runs had no audits: one worker's word stands for each of their episodes.")
+    return (*limits, *_ALWAYS)
 
 
-def matching(own: Card, found: Card) -> Card:
-    """`own`, with bounds of intervals in `found` that are close enough."""
-    cells = [_nearest(*each) for each in zip(own.results, found.results, strict=False)]
+def matching(own: Card, claimed: Card) -> Card:
+    """`own`, with bounds of intervals in `claimed` that are close enough."""
+    cells = [_nearest(*each) for each in zip(own.results, claimed.results, strict=False)]
     return msgspec.structs.replace(own, results=(*cells, *own.results[len(cells) :]))
 
 

@@ -22,7 +22,7 @@ from typing import NamedTuple
 import msgspec
 import numpy as np
 
-from evopolicy_common.errors import ConfigError, EvopolicyError, ProtocolError, RefusedError
+from evopolicy_common.errors import ConfigError, EvopolicyError, RefusedError
 from evopolicy_common.messages.environment import Split
 from evopolicy_common.records import journal
 from evopolicy_common.records.canary import CANARY
@@ -31,7 +31,7 @@ from evopolicy_common.records.episodes.trajectory import Recorder, Trajectory
 from evopolicy_common.records.journal import Result, SubmitResult
 from evopolicy_common.records.policies.bundles import Bundle
 from evopolicy_common.records.policies.checkpoints import bundle_of
-from evopolicy_common.records.run_files import read_record, run_folders
+from evopolicy_common.records.run_files import read_or_reason, run_folders
 from evopolicy_common.records.run_record import RunRecord, decode_run_record, encode_run_record
 from evopolicy_common.records.secrets import Passed, read_passed
 from evopolicy_common.regular_files import read_regular
@@ -77,36 +77,30 @@ class _GoneError(EvopolicyError):
 def find_runs(paths: Sequence[Path]) -> tuple[list[tuple[Path, RunRecord]], list[Removed]]:
     """The finished runs in and below these folders, in the order of the coordinator's names, and the folders that are
     left out. ConfigError where no run is left."""
-    found: dict[str, tuple[Path, RunRecord]] = {}
+    runs: dict[str, tuple[Path, RunRecord]] = {}
     folders, without = run_folders(paths)
-    left = [(path, "no run directory in it or below") for path in without]
+    left_out = [(path, "no run directory in it or below") for path in without]
     for folder in folders:
-        try:
-            record = read_record(folder)
-        except FileNotFoundError:
-            why = "the run did not finish: it has no run.json"
-        except OSError as error:
-            why = f"run.json cannot be read: {error.strerror}"
-        except ProtocolError as error:
-            why = str(error)
+        record = read_or_reason(folder)
+        if isinstance(record, str):
+            why = record
+        elif record.committed is None:
+            why = "it has no commitment: its coordinator kept no journal when it opened the run"
+        elif record.replay_of:
+            why = f"it is a replay of run {record.replay_of}, and no run of its own"
+        elif record.run in runs:
+            why = f"it repeats the run in {runs[record.run][0]}"
         else:
-            if record.committed is None:
-                why = "it has no commitment: its coordinator kept no journal when it opened the run"
-            elif record.replay_of:
-                why = f"it is a replay of run {record.replay_of}, and no run of its own"
-            elif record.run in found:
-                why = f"it repeats the run in {found[record.run][0]}"
-            else:
-                found[record.run] = folder, record
-                continue
-        left.append((folder, why))
+            runs[record.run] = folder, record
+            continue
+        left_out.append((folder, why))
     attempts = [each for path in paths for each in path.rglob(".attempts") if each.is_dir()]
-    left += [(each, "another attempt replaced it") for each in run_folders(attempts)[0]]
-    removed = [Removed(what=str(folder), why=why) for folder, why in left]
-    if not found:
+    left_out += [(each, "another attempt replaced it") for each in run_folders(attempts)[0]]
+    removed = [Removed(what=str(folder), why=why) for folder, why in left_out]
+    if not runs:
         listed = "; ".join(f"{each.what}: {each.why}" for each in removed[:8])
         raise ConfigError(f"no finished run to publish: {listed}")
-    return [found[run] for run in sorted(found)], removed
+    return [runs[run] for run in sorted(runs)], removed
 
 
 class _Secret(NamedTuple):
@@ -155,47 +149,45 @@ class Publisher:
         self,
         runs: Sequence[tuple[Path, RunRecord]],
         out: Path,
-        left: Sequence[Removed] = (),
+        left_out: Sequence[Removed] = (),
         *,
         licence: str = "",
         card: Path | None = None,
     ) -> Published:
-        """Writes `out` atomically. Raises ConfigError when the coordinator refuses. `left`: folders that are
-        left out. `licence`: of the file, for its card. `card`: a folder for copies of card and descriptions."""
-        left = list(left)
+        """Writes `out` atomically. Raises ConfigError when the coordinator refuses. `left_out`: folders that are not
+        published. `licence`: of the file, for its card. `card`: a folder for copies of card and descriptions."""
         sources = [_Source(folder, record, read_passed(folder)) for folder, record in runs]
-        self._stop_at(
-            [
-                secret
-                for each in sources
-                for path in sorted((each.folder / "checkpoints").glob("submit_*"))
-                if (bundle := _bundle(path)) is not None
-                for secret in self._in_policy(path, bundle, each.passed)
-            ]
-        )
+        secrets = [
+            secret
+            for each in sources
+            for path in sorted((each.folder / "checkpoints").glob("submit_*"))
+            if (bundle := _bundle(path)) is not None
+            for secret in self._in_policy(path, bundle, each.passed)
+        ]
+        self._stop_at(secrets)
         try:
             await self._ask.disclose(tuple(record.run for _, record in runs))
         except RefusedError as error:
             named = [str(folder) for folder, record in runs if record.run in str(error)]
-            named = named or [each.what for each in left if "did not finish" in each.why]
+            named = named or [each.what for each in left_out if "did not finish" in each.why]
             where = f" ({', '.join(named[:8])})" if named else ""
             raise ConfigError(f"{error}{where}") from error
         entries = await self._ask.journal()
-        described: list[cards.Source] = []
+        folders_left_out, described = list(left_out), list[cards.Source]()
         partial = out.with_name(f".{out.name}.partial")
-        writer = self._writer = Writer(partial)
+        self._writer = Writer(partial)
         try:
             for number, source in enumerate(sources):
-                record = source.record
+                record, before = source.record, len(self._removed)
                 self._tell(f"{number + 1} of {len(runs)}: {record.agent.entry} on {record.env}")
-                before = len(self._removed)
                 try:
                     described.append(await self._add_run(source, f"runs/{len(described):04d}"))
                 except _GoneError as error:  # before the first file
                     del self._removed[before:]
-                    left.append(Removed(what=str(source.folder), why=str(error)))
+                    folders_left_out.append(Removed(what=str(source.folder), why=str(error)))
             if not described:
-                raise ConfigError(f"no run to publish: {left[-1].what}: {left[-1].why}")
+                last = folders_left_out[-1]
+                raise ConfigError(f"no run to publish: {last.what}: {last.why}")
             self._add_clean(contents.JOURNAL, contents.journal_lines(entries))
             self._add_clean(contents.REMOVED, contents.document(tuple(self._removed)))
             head, software = journal.heads(entries)[-1], version("evopolicy")
@@ -224,27 +216,26 @@ class Publisher:
             self._add(contents.MANIFEST, manifest)
             signature = contents.Signature(key=signed.key, signature=signed.signature)
             self._add(contents.SIGNATURE, contents.document(signature))
-            writer.close()
+            self._writer.close()
             partial.replace(out)
-            if card is not None:
-                with out.open("rb") as stream:
-                    sha256 = hashlib.file_digest(stream, "sha256").hexdigest()
-                file = descriptions.File(out.name, sha256, out.stat().st_size)
-                for name, data in descriptions.files(made, digests, file).items():
-                    (card / name).write_bytes(data)
         finally:
             partial.unlink(missing_ok=True)
-        ids = [each.result.run for each in described]
-        listed = contents.listing(map(journal.read_entry, entries), ids)
+        if card is not None:
+            with out.open("rb") as stream:
+                sha256 = hashlib.file_digest(stream, "sha256").hexdigest()
+            file = descriptions.File(out.name, sha256, out.stat().st_size)
+            for name, data in descriptions.files(made, digests, file).items():
+                (card / name).write_bytes(data)
+        listed = contents.listing(map(journal.read_entry, entries), [each.result.run for each in described])
         return Published(
             path=str(out),
             bytes=out.stat().st_size,
-            runs=len(ids),
+            runs=len(described),
             signer=signed.key,
             journal_head=head,
             removed=tuple(self._removed),
             left_out=tuple(each for each in listed if each.state != "published"),
-            folders_left_out=tuple(left),
+            folders_left_out=tuple(folders_left_out),
             completeness=contents.completeness(listed),
         )
 
@@ -253,17 +244,22 @@ class Publisher:
         self._written[name] = contents.digest(data)
 
     def _add_clean(self, name: str, data: bytes, passed: Passed | None = None) -> None:
-        self._must_be_clean(name, data, passed)
+        """Adds a file that cannot be left out: ConfigError where the search finds anything in it."""
+        self._stop_at(self._secrets(name, data, passed), always=True)
+        if kinds := scrub.search(data, self._needles):
+            raise ConfigError(
+                f"{name} would reveal {kinds[0]}; nothing is published. Names of entries, models and experiments are"
+                " published as they are: use other names for the runs, or unset a variable whose value is such a name"
+            )
         self._add(name, data)
 
     def _leave_out(self, what: str, why: str) -> None:
         self._removed.append(Removed(what=what, why=why))
 
     async def _add_run(self, source: _Source, place: str) -> cards.Source:
-        record = source.record
-        opened = await self._ask.opening(record.run)
+        opened = await self._ask.opening(source.record.run)
         result = msgspec.json.decode(opened.result, type=Result)
-        kept, removed = scrub.record(record)
+        kept, removed = scrub.record(source.record)
         for each in removed:
             self._leave_out(f"{place}/run.json: {each.what}", each.why)
         groups: list[Group] = []
@@ -273,7 +269,7 @@ class Publisher:
             groups.append(group)
             if recordings is not None:
                 recorded[f"{place}/actions/{group.name}"] = recordings
-        run_json = encode_run_record(kept)
+        run_json, before = encode_run_record(kept), len(self._written)
         for name, data in (
             (contents.RUN, run_json),
             (contents.OPENING, opened.opening),
@@ -288,14 +284,11 @@ class Publisher:
             path = f"{place}/{contents.checkpoint_path(submit.submit_index)}"
             if submit.bundle is not None and (packed := self._checkpoint(source, submit, path)) is not None:
                 self._add(path, packed)
-        if self._with_logs and (log := self._log(source, f"{place}/{contents.LOG}")) is not None:
-            self._add(f"{place}/{contents.LOG}", log)
-        own = {
-            name.removeprefix(f"{place}/"): digest
-            for name, digest in self._written.items()
-            if name.startswith(f"{place}/")
-        }
-        self._add(f"{place}/{contents.DIGESTS}", contents.document(own))
+        if self._with_logs:
+            self._add_log(source, f"{place}/{contents.LOG}")
+        own = list(self._written.items())[before:]
+        digests = {name.removeprefix(f"{place}/"): digest for name, digest in own}
+        self._add(f"{place}/{contents.DIGESTS}", contents.document(digests))
         return cards.Source(place, decode_run_record(run_json), result)
 
     async def _group(
@@ -309,31 +302,29 @@ class Publisher:
             raise _GoneError(
                 f"the coordinator no longer has the episodes of {name}: `evopolicy gc` removed them"
             )
-        episodes = []
-        recordings: list[bytes | None] = []
-        found: list[_Secret] = []
+        episodes, recordings = [], []
+        finds: list[_Secret] = []
         for number, outcome in sorted(outcomes.items()):
-            failure = "" if outcome.failure is None else outcome.failure.category
             episodes.append(
                 Episode(
                     index=number,
                     episode_return=outcome.episode_return,
                     length=outcome.length,
-                    failure=failure,
+                    failure="" if outcome.failure is None else outcome.failure.category,
                 )
             )
             data = None
             if outcome.trajectory is not None:
                 trajectory = decode(await self._ask.fetch(outcome.trajectory))
                 texts = _texts(trajectory)
-                found += self._terms(texts)
-                found += self._secrets(f"{place}/actions/{name}/{number}", texts, source.passed)
+                finds += self._terms(texts)
+                finds += self._secrets(f"{place}/actions/{name}/{number}", texts, source.passed)
                 data = actions_only(trajectory)
             recordings.append(data)
         group = Group(split=split, submit_index=index, episodes=tuple(episodes))
-        if found:
-            self._stop_at(found)
-            self._leave_out(f"run {run}: actions of {name}", f"they held {found[0].what}")
+        if finds:
+            self._stop_at(finds)
+            self._leave_out(f"run {run}: actions of {name}", f"they held {finds[0].what}")
             return group, None
         return group, contents.pack_recordings(recordings)
 
@@ -343,68 +334,59 @@ class Publisher:
         if bundle is None or bundle.digest != submit.bundle:
             self._leave_out(what, "the run directory does not hold the policy that was submitted")
             return None
-        # Of files that have changed since the first look.
-        found = [*self._terms(bundle.packed), *self._in_policy(matches[0], bundle, source.passed)]
-        self._stop_at(found)
-        if found:
-            self._leave_out(what, f"it holds {found[0].what}")
+        # The files may have changed since the first search.
+        finds = [*self._terms(bundle.packed), *self._in_policy(matches[0], bundle, source.passed)]
+        self._stop_at(finds)
+        if finds:
+            self._leave_out(what, f"it holds {finds[0].what}")
             return None
         return bundle.packed
 
     def _in_policy(self, folder: Path, bundle: Bundle, passed: Passed | None) -> list[_Secret]:
         """Secrets in a run directory's policy. In its log they are replaced."""
         names = "\n".join(file.path for file in bundle.files).encode()
-        found = self._secrets(f"{folder} (names of files)", names, passed)
+        secrets = self._secrets(f"{folder} (names of files)", names, passed)
         for file in bundle.files:
-            found += self._secrets(str(folder / file.path), file.data, passed)
-        return found
+            secrets += self._secrets(str(folder / file.path), file.data, passed)
+        return secrets
 
     def _terms(self, data: bytes) -> list[_Secret]:
         return [_Secret("", what) for what in scrub.search(data, self._needles)]
 
     def _secrets(self, name: str, data: bytes, passed: Passed | None) -> list[_Secret]:
         """Secrets whose lines are not accepted."""
-        lines = scrub.secret_lines(data, passed)
-        found = [_Secret(f"{name}:{line}", what) for line, what in sorted(lines.items())]
-        return [each for each in found if os.path.abspath(each.place) not in self._accepted]
+        lines = sorted(scrub.secret_lines(data, passed).items())
+        places = [_Secret(f"{name}:{line}", what) for line, what in lines]
+        return [each for each in places if os.path.abspath(each.place) not in self._accepted]
 
-    def _stop_at(self, found: Sequence[_Secret], *, always: bool = False) -> None:
-        """Raises ConfigError for secrets, unless what holds them is left out."""
-        found = [each for each in found if each.place]
-        if not found or (self._remove_findings and not always):
+    def _stop_at(self, finds: Sequence[_Secret], *, always: bool = False) -> None:
+        """Raises ConfigError for secrets, unless the files that hold them are left out."""
+        secrets = [each for each in finds if each.place]
+        if not secrets or (self._remove_findings and not always):
             return
         here = f"{os.getcwd()}/"
-        shown = "; ".join(f"{each.place.removeprefix(here)}: {each.what}" for each in found[:_SHOWN])
-        more = f"; and {len(found) - _SHOWN} more" if len(found) > _SHOWN else ""
+        shown = "; ".join(f"{each.place.removeprefix(here)}: {each.what}" for each in secrets[:_SHOWN])
+        more = f"; and {len(secrets) - _SHOWN} more" if len(secrets) > _SHOWN else ""
         left_out = "" if always else "leave out these policies and recordings with --remove-findings, or "
         raise ConfigError(
             f"nothing is published, as this looks like secrets: {shown}{more}. Revoke real keys; then"
             f" {left_out}publish a line as it is with --accept-finding FILE:LINE"
         )
 
-    def _log(self, source: _Source, what: str) -> bytes | None:
-        """The agent's log without what the search finds; None where there is none to publish."""
+    def _add_log(self, source: _Source, name: str) -> None:
+        """Adds the agent's log, if there is one, without what the search finds."""
         path = source.folder / (source.record.artifacts.logs_agent or "logs/agent.jsonl")
         try:
             log = read_regular(path, contents.MAX_DOCUMENT_BYTES)
         except FileNotFoundError:
-            return None
+            return
         except OSError as error:
-            self._leave_out(what, error.strerror or "it cannot be read")
-            return None
+            self._leave_out(name, error.strerror or "it cannot be read")
+            return
         data, counts = scrub.redact(log, self._needles, source.passed)
-        for found, n in sorted(counts.items()):
-            self._leave_out(f"{what}: {n} places", f"they held {found}")
-        self._must_be_clean(what, data, source.passed)
-        return data
-
-    def _must_be_clean(self, name: str, data: bytes, passed: Passed | None = None) -> None:
-        self._stop_at(self._secrets(name, data, passed), always=True)
-        if found := scrub.search(data, self._needles):
-            raise ConfigError(
-                f"{name} would reveal {found[0]}; nothing is published. Names of entries, models and experiments are"
-                " published as they are: use other names for the runs, or unset a variable whose value is such a name"
-            )
+        for kind, n in sorted(counts.items()):
+            self._leave_out(f"{name}: {n} places", f"they held {kind}")
+        self._add_clean(name, data, source.passed)
 
 
 def _bundle(checkpoint: Path) -> Bundle | None:

@@ -19,7 +19,6 @@ Digests are SHA-256 (hex). JSON is as `document` makes it: the same content give
 
 from __future__ import annotations
 
-import hashlib
 import operator
 from collections.abc import Iterable, Sequence
 
@@ -53,6 +52,15 @@ RANDOM = -1
 """Submit index of the random reference."""
 
 
+digest = journal.digest
+"""SHA-256 (hex) of bytes."""
+
+
+def head_digest(head: str, at: float) -> str:
+    """The signed bytes of a countersignature."""
+    return digest(f"{head} {at!r}".encode())
+
+
 class Manifest(msgspec.Struct, frozen=True, kw_only=True):
     """The root of the tree of digests."""
 
@@ -84,11 +92,6 @@ class Countersignature(msgspec.Struct, frozen=True, kw_only=True):
     """Of `head_digest`."""
 
 
-def head_digest(head: str, at: float) -> str:
-    """The signed bytes of a countersignature."""
-    return digest(f"{head} {at!r}".encode())
-
-
 class Episode(msgspec.Struct, frozen=True, kw_only=True):
     """The result of one episode."""
 
@@ -115,9 +118,9 @@ class Group(msgspec.Struct, frozen=True, kw_only=True):
     @property
     def part(self) -> str:
         """The part of the run that it belongs to, in words."""
-        return (
-            "random" if self.submit_index == RANDOM else "held-out" if self.split == "heldout" else self.split
-        )
+        if self.submit_index == RANDOM:
+            return "random"
+        return "held-out" if self.split == "heldout" else self.split
 
 
 class Removed(msgspec.Struct, frozen=True, kw_only=True):
@@ -129,32 +132,26 @@ class Removed(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def group_name(split: str, submit_index: int) -> str:
-    """How a group is called in paths and findings."""
+    """A group's name in paths and findings."""
     return f"{split}-random" if submit_index == RANDOM else f"{split}-{submit_index:03d}"
 
 
 def wanted_groups(result: Result) -> list[tuple[Split, int, int]]:
     """The groups whose returns a result rests on: split, submit index, number of episodes (-1: all of the split)."""
+    groups: list[tuple[Split, int, int]] = []
     ok = [submit for submit in result.submits if submit.status == "ok"]
-    found: list[tuple[Split, int, int]] = [
-        ("train", each.submit_index, len(each.env_instances)) for each in ok
-    ]
-    found += [("validation", each.submit_index, -1) for each in ok if each.val_mean is not None]
+    groups += [("train", each.submit_index, len(each.env_instances)) for each in ok]
+    groups += [("validation", each.submit_index, -1) for each in ok if each.val_mean is not None]
     if result.heldout_returns and result.best_submit_index is not None:
-        found.append(("heldout", result.best_submit_index, len(result.heldout_returns)))
+        groups.append(("heldout", result.best_submit_index, len(result.heldout_returns)))
     if result.random_heldout_returns:
-        found.append(("heldout", RANDOM, len(result.random_heldout_returns)))
-    return found
+        groups.append(("heldout", RANDOM, len(result.random_heldout_returns)))
+    return groups
 
 
 def checkpoint_path(submit_index: int) -> str:
     """Below a run's folder."""
     return f"checkpoints/{submit_index:03d}"
-
-
-def digest(data: bytes) -> str:
-    """SHA-256 (hex)."""
-    return hashlib.sha256(data).hexdigest()
 
 
 def document(content: object) -> bytes:
@@ -183,7 +180,7 @@ _recordings = msgspec.msgpack.Decoder(list[bytes | None])
 
 
 def unpack_recordings(data: bytes) -> list[bytes | None]:
-    """ProtocolError for what `pack_recordings` did not make."""
+    """ProtocolError for bytes that `pack_recordings` did not make."""
     try:
         return _recordings.decode(data)
     except DECODE_ERRORS as error:
@@ -200,38 +197,30 @@ class Listed(msgspec.Struct, frozen=True, kw_only=True):
     repeat: int
     attempt: int
     state: str
-    """`published`, or what became of it: a status of `run.json`, `not finished`, or `replayed` for a replay."""
+    """`published`, a status of `run.json`, `not finished`, or `replayed` for a replay."""
     replaced_by: str = ""
     """The run that was opened later in its place; empty for none."""
 
 
 def listing(entries: Iterable[journal.Entry], published: Iterable[str]) -> tuple[Listed, ...]:
-    """Every run that the journal has of the entries that `published` runs are of, in the order in which they were
-    opened."""
+    """Every run in the journal of the `published` runs' entries, in the order in which they were opened."""
     chosen, entries = set(published), list(entries)
     opened = [each for each in entries if isinstance(each, journal.Opened)]
     status = {each.run: each.status for each in entries if isinstance(each, journal.Ended)}
     names = {each.entry for each in opened if each.run in chosen}
     place = operator.attrgetter("exp_id", "entry", "env", "repeat")
     last = {place(each): each.run for each in opened if not each.replay_of}
-    found = []
-    for each in opened:
-        if each.entry in names:
-            left = "replayed" if each.replay_of else status.get(each.run, "not finished")
-            later = each.run if each.replay_of else last[place(each)]
-            found.append(
-                Listed(
-                    run=each.run,
-                    entry=each.entry,
-                    env=each.env,
-                    exp_id=each.exp_id,
-                    repeat=each.repeat,
-                    attempt=each.attempt,
-                    state="published" if each.run in chosen else left,
-                    replaced_by="" if later == each.run else later,
-                )
-            )
-    return tuple(found)
+
+    def listed(each: journal.Opened) -> Listed:
+        state = "replayed" if each.replay_of else status.get(each.run, "not finished")
+        later = each.run if each.replay_of else last[place(each)]
+        return Listed(
+            **{name: getattr(each, name) for name in ("run", "entry", "env", "exp_id", "repeat", "attempt")},
+            state="published" if each.run in chosen else state,
+            replaced_by="" if later == each.run else later,
+        )
+
+    return tuple(listed(each) for each in opened if each.entry in names)
 
 
 def completeness(listed: Sequence[Listed]) -> str:

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple, get_type_hints
 import msgspec
 
 from evopolicy_results.publish import contents
-from evopolicy_results.publish.card import Card, CardRun
+from evopolicy_results.publish.card import AgentCost, Card, CardRun, Cell
 
 _SHOWN = 4
 """Values of a condition that the text lists."""
@@ -61,28 +61,10 @@ checkpoint. The score is the checkpoint's mean return on other hidden cases.
 *Over*: what a repetition of the experiment would draw again, or why there is no interval. *Random*: uniform
 random actions on the same cases.
 """,
-        *_table(
-            "environment entry runs mean 95_%_interval over random",
-            (
-                (
-                    *(each.env, each.entry, each.runs, _number(each.mean)),
-                    "none" if each.low is None else f"{_number(each.low)} to {_number(each.high)}",
-                    *(each.over, _number(each.random)),
-                )
-                for each in card.results
-            ),
-        ),
+        *_table("environment entry runs mean 95_%_interval over random", map(_result, card.results)),
         "\n## Agents and costs\n\n*Hours*: the runs' wall times. *CPU s*: the agents' own.\n",
         *_table(
-            "entry agent runs submits episodes hours CPU_s turns tokens US_dollars",
-            (
-                (
-                    *(each.entry, "; ".join(each.agents), each.runs, each.submits, each.episodes),
-                    *(f"{each.wall_s / 3600:.2f}", _number(each.cpu_s, "not counted"), each.turns),
-                    *(_number(each.tokens, "not counted"), _number(each.cost, "not known")),
-                )
-                for each in card.agents
-            ),
+            "entry agent runs submits episodes hours CPU_s turns tokens US_dollars", map(_cost, card.agents)
         ),
         "\n## Conditions\n\nThe number of runs stands after values that not all runs have.\n",
     ]
@@ -96,8 +78,8 @@ random actions on the same cases.
 Of the published file: {_plain(card.licence) or "not stated"}. Of the packages and assets of the played
 families, as the packages state them (none for toys):
 """)
-    found = ((each.what, each.version, each.licence, ", ".join(each.used_by)) for each in card.licences)
-    lines += _table("package_or_asset version licence families", found)
+    rows = ((each.what, each.version, each.licence, ", ".join(each.used_by)) for each in card.licences)
+    lines += _table("package_or_asset version licence families", rows)
     lines.append(f"""
 ## Who signs, and how to check
 
@@ -111,6 +93,18 @@ families, as the packages state them (none for toys):
 - {_plain(card.canary)}
 """)
     return "\n".join(lines)
+
+
+def _result(cell: Cell) -> tuple[object, ...]:
+    interval = "none" if cell.low is None else f"{_number(cell.low)} to {_number(cell.high)}"
+    return cell.env, cell.entry, cell.runs, _number(cell.mean), interval, cell.over, _number(cell.random)
+
+
+def _cost(agent: AgentCost) -> tuple[object, ...]:
+    hours, cpu_s = f"{agent.wall_s / 3600:.2f}", _number(agent.cpu_s, "not counted")
+    counts = agent.runs, agent.submits, agent.episodes, hours, cpu_s, agent.turns
+    used = _number(agent.tokens, "not counted"), _number(agent.cost, "not known")
+    return agent.entry, "; ".join(agent.agents), *counts, *used
 
 
 def _table(titles: str, rows: Iterable[tuple[object, ...]]) -> list[str]:

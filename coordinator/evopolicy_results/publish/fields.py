@@ -1,4 +1,4 @@
-"""What covers each field of each file of published results. Pure.
+"""The fields of published files, each with what covers it. Pure.
 
 Rules that this module owns:
 - Files are JSON in one spelling: a key that occurs twice, another order or other spaces are refused.
@@ -10,7 +10,7 @@ Rules that this module owns:
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Any, Literal
 
 import msgspec
@@ -157,10 +157,10 @@ def leaves(value: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, 
         yield path, value
 
 
-def unknown_and_claims(name: str, value: Any, committed: dict[str, Any]) -> tuple[list[str], list[str]]:
-    """The fields that the table does not name or that publication empties, and those that are claims. `committed`: the
-    fields of
-    `run.json` that the run's result holds."""
+def unknown_and_claims(name: str, value: Any, committed: Mapping[str, Any]) -> tuple[list[str], list[str]]:
+    """The fields that the table does not name or that publication empties, and those that are claims.
+
+    `committed`: the fields of `run.json` that the run's result holds."""
     tree = _TREES[file_kind(name) or ""]
     unknown: dict[str, None] = {}
     claims: dict[str, None] = {}

@@ -3,7 +3,7 @@ documents."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from typing import Any, Literal, NamedTuple, Protocol, TypeVar
 
 import msgspec
@@ -15,7 +15,7 @@ from evopolicy_common.records.journal import Opening, Result
 from evopolicy_common.records.policies import bundles
 from evopolicy_common.records.policies.bundles import Bundle
 from evopolicy_common.records.run_record import RunRecord
-from evopolicy_results.publish import contents
+from evopolicy_results.publish import contents, fields
 from evopolicy_results.publish.contents import Group, Listed, Removed
 
 T = TypeVar("T")
@@ -35,7 +35,7 @@ KINDS = {
     "scores": "scores follow from the returns of the episodes",
     "recordings": "returns follow from the recorded rewards",
     "checkpoints": "the policies are those that were submitted",
-    "signals": "nothing in checkpoints and logs asks for a look (no verdict)",
+    "signals": "no signals in checkpoints and logs (no verdict)",
     "logs": "agents' logs are what the agents wrote",
     "card": "the evaluation card and its descriptions follow from the runs",
     "completeness": "every run that was opened for the entries is here",
@@ -45,7 +45,9 @@ KINDS = {
     "replay": "the environments give the recorded rewards for the recorded actions",
 }
 """The checks, in the order of the output."""
-
+UPDATE = "it was added, or a later version of evopolicy wrote it (then update)"
+_SHOWN = 8
+"""Unknown fields of a file that become findings."""
 
 State = Literal["ok", "failed", "open"]
 
@@ -86,8 +88,8 @@ class PublishedRun(msgspec.Struct, frozen=True, kw_only=True):
 
     def cases(self, split: Split) -> tuple[Any, ...]:
         """The cases of a split."""
-        found: tuple[Any, ...] = getattr(self.opening, split)
-        return found
+        cases: tuple[Any, ...] = getattr(self.opening, split)
+        return cases
 
     def recordings(self, files: Files, group: str) -> list[bytes | None]:
         """The packed recordings of a group's episodes, by its name; empty without any. ProtocolError for damaged
@@ -97,17 +99,23 @@ class PublishedRun(msgspec.Struct, frozen=True, kw_only=True):
             return []
         return contents.unpack_recordings(files.read(path, contents.MAX_RECORDING_BYTES))
 
-    def bundles(self, files: Files) -> Iterator[tuple[int, Bundle]]:
-        """The published policies by submit index. Leaves out damaged bundles, which the check of checkpoints
-        reports."""
+    def policies(self, files: Files, damaged: Collection[str] = ()) -> Iterator[tuple[int, Bundle | str]]:
+        """By index of each submit with a policy: the published policy, or why there is none; empty where it was
+        withheld or is `damaged`."""
         for submit in self.result.submits:
             path = f"{self.folder}/{contents.checkpoint_path(submit.submit_index)}"
-            if submit.bundle is not None and path in files.names:
-                data = files.read(path, contents.MAX_DOCUMENT_BYTES * 2)
+            policy: Bundle | str = ""
+            if submit.bundle and path in files.names and path not in damaged:
                 try:
-                    yield submit.submit_index, bundles.load(data, submit.bundle)
-                except BundleError:
-                    continue
+                    policy = bundles.load(files.read(path, contents.MAX_DOCUMENT_BYTES * 2), submit.bundle)
+                except (BundleError, ProtocolError) as error:
+                    policy = str(error)
+            if submit.bundle:
+                yield submit.submit_index, policy
+
+    def bundles(self, files: Files) -> dict[int, Bundle]:
+        """The published policies by submit index."""
+        return {index: each for index, each in self.policies(files) if not isinstance(each, str)}
 
 
 class Checked(msgspec.Struct, kw_only=True):
@@ -123,19 +131,26 @@ class Checked(msgspec.Struct, kw_only=True):
     claims: dict[str, list[str]] = {}
     """Fields that nobody can check, by file (`fields`)."""
     recorded: dict[str, dict[str, tuple[int, int]]] = {}
-    """By run and part (`contents.PARTS`): the episodes that have a recording, and all."""
+    """By run and `Group.part`: the episodes that have a recording, and all."""
+    covered: dict[str, int] = {}
+    """By part, the episodes that a replay played."""
 
     @property
     def failed(self) -> bool:
         return any(each.state == "failed" for each in self.findings)
 
-    covered: dict[str, int] = {}
-    """By part, the episodes that a replay played."""
-
     def state_of(self, kind: str) -> str:
         """`failed`, `open` or `ok`, the gravest of the kind's findings; empty when there are none."""
         states = {each.state for each in self.findings if each.kind == kind}
         return next((state for state in ("failed", "open", "ok") if state in states), "")
+
+    def grouped(self) -> dict[tuple[str, State, str], str]:
+        """The findings by kind, state and text, in the order of `KINDS`, with the run or the number of runs."""
+        runs: dict[tuple[str, State, str], dict[str, None]] = {}
+        order = {kind: place for place, kind in enumerate(KINDS)}
+        for each in sorted(self.findings, key=lambda each: order[each.kind]):
+            runs.setdefault((each.kind, each.state, each.text), {})[each.run] = None
+        return {key: next(iter(of)) if len(of) == 1 else f"{len(of)} runs" for key, of in runs.items()}
 
     def coverage(self) -> str:
         """The episodes that a replay played of all, by part, such as `2 of 5 train, 0 of 3 held-out`."""
@@ -149,21 +164,29 @@ class Checked(msgspec.Struct, kw_only=True):
         """The parts of a run with episodes that have no recording, such as `0 of 6 held-out`."""
         return [f"{n} of {of} {part}" for part, (n, of) in self.recorded.get(run, {}).items() if n < of]
 
-    def claim(self, file: str, fields: Iterable[str]) -> None:
-        if found := list(fields):
-            self.claims.setdefault(file, []).extend(found)
+    def claim(self, file: str, names: Iterable[str]) -> None:
+        if claims := list(names):
+            self.claims.setdefault(file, []).extend(claims)
 
     def add(self, kind: str, state: State, text: str, run: str = "") -> None:
         self.findings.append(Finding(kind=kind, state=state, text=text, run=run))
 
-    def conclude(self, kind: str, faults: Sequence[str], ok: str, run: str = "", left: str = "") -> None:
-        """Adds the faults as failed; without any, that all is `ok`, or is open as `left` says."""
+    def conclude(self, kind: str, faults: Sequence[str], ok: str, run: str = "", undecided: str = "") -> None:
+        """Adds the faults as failed, and `undecided` as open; without any, `ok`."""
         for text in faults:
             self.add(kind, "failed", text, run)
-        if left:
-            self.add(kind, "open", left, run)
+        if undecided:
+            self.add(kind, "open", undecided, run)
         elif not faults:
             self.add(kind, "ok", ok, run)
+
+    def refuse_unknown(self, name: str, value: Any, committed: Mapping[str, Any], run: str = "") -> None:
+        """Refuses fields that the table of `fields` does not name, and notes those that are claims."""
+        unknown, claims = fields.unknown_and_claims(name, value, committed)
+        for field in unknown[:_SHOWN]:
+            text = f"{name}: {field[:120]} is no field of published results: {UPDATE}"
+            self.add("format", "failed", text, run)
+        self.claim(name, claims)
 
 
 class Fault(NamedTuple):
@@ -172,13 +195,22 @@ class Fault(NamedTuple):
 
 
 class History(NamedTuple):
+    """The journal: its entries, and the head after each."""
+
     entries: list[journal.Entry]
     heads: list[str]
+
+    def entry(self, kind: type[T], run: str) -> tuple[int, T] | None:
+        """The number and content of a run's entry."""
+        entries = enumerate(self.entries)
+        return next(
+            ((n, one) for n, one in entries if isinstance(one, kind) and getattr(one, "run", "") == run), None
+        )
 
 
 def decoded(name: str, data: bytes, kind: Callable[..., T] | type[T]) -> T:
     try:
-        found: T = msgspec.json.decode(data, type=kind)
+        content: T = msgspec.json.decode(data, type=kind)
     except (*DECODE_ERRORS, ValueError) as error:
         raise ProtocolError(f"{name} is damaged: {error}") from error
-    return found
+    return content

@@ -3,22 +3,20 @@
 Rules that this module owns:
 - Nothing of the file is executed, and no limit of it is taken over: actions are data, the environments are the
   installed ones, and the worker's slots run them in its jail.
-- The splits are those of the opening, which the commitment fixes. A run whose environment is not installed, or in other
-  versions than the run tells, is not played: other versions give other numbers. Nor is one whose environment does not
-  repeat episodes according to this machine; the file's own statement does not count.
-- A policy is untrusted code: it runs in the worker's sandbox, with default limits, like any agent's. It gets
-  the published arguments (`env_meta`, episode indexes) and other random seeds than in the run, which are
-  secret. Only policies that declare `deterministic = True` are played. One that fails here, or failed in the
-  run, shows nothing: limits and machines differ.
-- The packages that a run's policies import are those that its `run.json` names, and only if the operator names them
-  too: names in the file alone make nothing of this machine visible or imported.
+- The splits are those of the opening, which the commitment fixes. A run is not played whose environment is not
+  installed, is in other versions, which give other numbers, or does not repeat episodes according to this machine.
+- A policy is untrusted code: it runs in the worker's sandbox, with default limits, like any agent's. It gets the
+  published arguments (`env_meta`, episode indexes) and other random seeds, so only policies that declare
+  `deterministic = True` are played. One that fails here, or failed in the run, shows nothing.
+- Policies import only packages that their `run.json` and the operator name: names in the file alone make nothing of
+  this machine visible or imported.
 """
 
 from __future__ import annotations
 
 import contextlib
 import shlex
-from collections.abc import AsyncIterator, Awaitable, Callable, Collection, Sequence
+from collections.abc import AsyncIterator, Awaitable, Callable, Collection, Mapping, Sequence
 from pathlib import Path
 
 import msgspec
@@ -39,7 +37,7 @@ from evopolicy_common.records.splits import FILE_STEMS, SPLITS, SplitFile, cases
 from evopolicy_common.wire import credentials, transport
 from evopolicy_results.evaluations import Cases, Evaluations, sample, unlike
 from evopolicy_results.publish.contents import Group
-from evopolicy_results.publish.findings import Checked, Files, PublishedRun
+from evopolicy_results.publish.findings import Checked, Files, PublishedRun, State
 from evopolicy_results.publish.run_rules import recording_of
 
 LAST_PLACES = 4
@@ -64,7 +62,7 @@ run's."""
 
 
 async def replay(files: Files, checked: Checked, share: float, seed: int, slots: int, tell: Tell) -> None:
-    """Plays a share of all recorded episodes, drawn by `seed`, and adds what came of it to `checked`."""
+    """Plays a share of all recorded episodes, drawn by `seed`, and adds the findings to `checked`."""
     chosen = draw(checked.runs, share, seed)
     if not chosen:
         checked.add("replay", "open", "there are no episodes to play")
@@ -74,19 +72,21 @@ async def replay(files: Files, checked: Checked, share: float, seed: int, slots:
     ) -> None:
         name, played, alike = run.opening.run, 0, True
         for part in parts:
-            n, faults = await _play(evaluations, files, part)
-            checked.covered[part.group.part] = checked.covered.get(part.group.part, 0) + n
-            played += n
-            for fault, rounding in faults:
+            recorded = _recorded(files, part)
+            played += len(recorded)
+            covered = checked.covered.get(part.group.part, 0)
+            checked.covered[part.group.part] = covered + len(recorded)
+            async for fault, is_rounding in _replayed(evaluations, part, recorded):
                 alike = False
-                if other_cpu and rounding:
+                state: State = "open" if other_cpu and is_rounding else "failed"
+                if state == "open":
                     fault += (
                         f", {LAST_PLACES} units in the last place at most: this machine's processor has other"
                         " features than the run's"
                     )
                 elif other_cpu:
                     fault += "; other features of the processor do not explain this"
-                checked.add("replay", "open" if other_cpu and rounding else "failed", fault, name)
+                checked.add("replay", state, fault, name)
         # A replay shows nothing of episodes without a recording, however many it drew.
         missing = checked.unrecorded(name)
         if alike:
@@ -98,33 +98,38 @@ async def replay(files: Files, checked: Checked, share: float, seed: int, slots:
     await play_runs("replay", chosen, checked, slots, tell, play_run)
 
 
-async def _play(evaluations: Evaluations, files: Files, part: Chosen) -> tuple[int, list[tuple[str, bool]]]:
-    """How many of these episodes were played, and what differed, each with whether it may be a matter of rounding."""
-    settings, group = part.run.opening.settings, part.group
+def _recorded(files: Files, part: Chosen) -> dict[int, bytes]:
+    """The recordings of the chosen episodes, by index."""
     recorded: dict[int, bytes] = {}
-    actions: list[bytes] = []
     with contextlib.suppress(ProtocolError):  # reported by the check of recordings
-        for index, data in enumerate(part.run.recordings(files, group.name)):
+        for index, data in enumerate(part.run.recordings(files, part.group.name)):
             if data is not None and index in part.indexes:
-                actions.append(compare.action_log(recording_of(data).actions))
+                recording_of(data)
                 recorded[index] = data
-    faults: list[tuple[str, bool]] = []
+    return recorded
+
+
+async def _replayed(
+    evaluations: Evaluations, part: Chosen, recorded: Mapping[int, bytes]
+) -> AsyncIterator[tuple[str, bool]]:
+    """Replays the recorded actions. Yields the differences, each with whether it may be a matter of rounding."""
+    settings, group = part.run.opening.settings, part.group
     if not recorded:
-        return 0, faults
+        return
+    actions = [compare.action_log(recording_of(data).actions) for data in recorded.values()]
     async for index, outcome in evaluations.replayed(
         part.cases, list(recorded), env=settings.env, conditions=settings, actions=actions
     ):
         place, told = f"{group.name}, episode {index}", group.episodes[index].episode_return
         if outcome is None or outcome.trajectory is None:
-            faults.append((f"{place}: not played to its end", False))
+            yield f"{place}: not played to its end", False
             continue
         before, again = recording_of(recorded[index]), await evaluations.recording(outcome)
         fault = compare.first_difference(before, again)
         if fault is None and not compare.same(told, outcome.episode_return):
             fault = f"return {told!r} is told, {outcome.episode_return!r} came"
         if fault is not None:
-            faults.append((f"{place}: {fault}", rounded(before, again)))
-    return len(recorded), faults
+            yield f"{place}: {fault}", rounded(before, again)
 
 
 async def play_policies(
@@ -144,37 +149,34 @@ async def play_policies(
     chosen: list[Chosen] = []
     drawn = draw(checked.runs, share, seed)
     for run in checked.runs:
-        found = {
+        own = {
             (run.folder, index): bundle
-            for index, bundle in run.bundles(files)
+            for index, bundle in run.bundles(files).items()
             if declares_deterministic({file.path: file.data for file in bundle.files})
         }
-        declared |= found
-        others = sum(submit.bundle is not None for submit in run.result.submits) - len(found)
+        declared |= own
+        others = sum(submit.bundle is not None for submit in run.result.submits) - len(own)
         if others:
             text = f"{others} policies do not declare themselves deterministic, or were withheld: not played"
             checked.add("policies", "open", text, run.opening.run)
-        own = [each for each in drawn if (each.run.folder, each.group.submit_index) in found]
-        if found and not own:
+        parts = [each for each in drawn if (each.run.folder, each.group.submit_index) in own]
+        if own and not parts:
             text = "no episode of its deterministic policies was drawn"
             checked.add("policies", "open", text, run.opening.run)
-        if run.opening.settings.policy_scope == "submit":
-            # One policy plays the whole list, of which no part can be played alone.
-            own = [
-                msgspec.structs.replace(each, indexes=tuple(range(len(each.cases.env_instances))))
-                for each in own
-            ]
-        chosen += own
+        for part in parts:
+            if run.opening.settings.policy_scope == "submit":
+                # One policy plays the whole list, of which no part can be played alone.
+                part = msgspec.structs.replace(part, indexes=tuple(range(len(part.cases.env_instances))))
+            chosen.append(part)
 
     async def play_run(
         evaluations: Evaluations, run: PublishedRun, parts: Sequence[Chosen], other_cpu: bool
     ) -> None:
-        same = unknown = 0
+        name, same, unknown = run.opening.run, 0, 0
         differ: list[str] = []
         for part in parts:
-            settings, group = run.opening.settings, part.group
-            recordings = dict(enumerate(run.recordings(files, group.name)))
-            if not recordings:
+            settings, group, recorded = run.opening.settings, part.group, _recorded(files, part)
+            if not recorded:
                 unknown += len(part.indexes)
                 continue
             async for index, outcome in evaluations.replayed(
@@ -186,7 +188,7 @@ async def play_policies(
                 # As in the run: train recordings have the policy's actions, hidden ones the played ones.
                 record="full" if group.split == "train" else "actions",
             ):
-                data, failed = recordings.get(index), group.episodes[index].failure
+                data, failed = recorded.get(index), group.episodes[index].failure
                 if data is None or failed or outcome is None or outcome.failure is not None:
                     unknown += 1
                 elif (fault := await _difference(evaluations, recording_of(data), outcome)) is None:
@@ -194,7 +196,6 @@ async def play_policies(
                 else:
                     text = "the policy declares itself deterministic and gave other actions"
                     differ.append(f"{group.name}, episode {index}: {text}: {fault}")
-        name = run.opening.run
         for text in differ:
             if other_cpu:
                 text += (
@@ -242,37 +243,34 @@ async def play_runs(
     """Plays runs on as many clusters, one after another, as their cases and packages ask for. Adds to `checked` those
     that cannot be played. `packages`: those that the policies may import; None where no policy is played."""
     by_run: dict[str, list[Chosen]] = {}
-    layers: list[tuple[tuple[str, ...], dict[str, str], list[PublishedRun]]] = []
-    for each in chosen:
-        by_run.setdefault(each.run.folder, []).append(each)
-    for folder, (part, *_) in list(by_run.items()):
-        run = part.run
+    clusters: dict[tuple[tuple[str, ...], int], list[PublishedRun]] = {}
+    """Runs by their packages and the number of their cases in `known`: a cluster has one set of an environment's."""
+    known: dict[tuple[tuple[str, ...], str], list[str]] = {}
+    for run, parts in ((run, [each for each in chosen if each.run is run]) for run in checked.runs):
         env, imported = run.opening.settings.env, packages_in(run.record.versions.fingerprint)
         lacking = [name for name in imported if packages is not None and name not in packages]
+        if not parts:
+            continue
         # A name that is not of an installed environment could be that of a module to import.
         if not (catalogue.is_shipped(env) or env in catalogue.plugins()):
             checked.add(kind, "open", f"{env} is not installed here", run.opening.run)
         elif lacking:
             checked.add(kind, "open", f"not played: {not_allowed(lacking)}", run.opening.run)
         else:
-            # A cluster has one set of cases of each environment.
+            by_run[run.folder] = parts
             cases = cases_hash(case for split in SPLITS for case in run.cases(split))
             offered = () if packages is None else imported
-            for has, known, members in layers:
-                if has == offered and known.setdefault(env, cases) == cases:
-                    members.append(run)
-                    break
-            else:
-                layers.append((offered, {env: cases}, [run]))
-            continue
-        del by_run[folder]
+            numbered = known.setdefault((offered, env), [])
+            if cases not in numbered:
+                numbered.append(cases)
+            clusters.setdefault((offered, numbered.index(cases)), []).append(run)
     total = sum(len(each.indexes) for parts in by_run.values() for each in parts)
     played = 0
 
     def told(count: int, waits_for: str) -> None:
         tell(played + count, total)
 
-    for offered, _, runs in layers:
+    for (offered, _), runs in clusters.items():
         try:
             async with _cluster_of(runs, slots, told, offered) as evaluations:
                 for run in runs:
@@ -297,7 +295,7 @@ def draw(runs: Sequence[PublishedRun], share: float, seed: int) -> list[Chosen]:
     """A share of all episodes of the runs, by group. Leaves out those whose cases cannot be."""
     groups = [(run, group) for run in runs for group in run.groups]
     sizes = [len(group.episodes) for _, group in groups]
-    found = []
+    chosen = []
     for k, drawn in sample(sizes, max(1, round(share * sum(sizes))), seed):
         run, group = groups[k]
         submit = next((one for one in run.result.submits if one.submit_index == group.submit_index), None)
@@ -306,18 +304,16 @@ def draw(runs: Sequence[PublishedRun], share: float, seed: int) -> list[Chosen]:
         indexes = tuple(index for index in drawn if index < len(ids))
         if not indexes or not all(0 <= each < len(run.cases(group.split)) for each in ids):
             continue
-        used = sum(
-            len(one.env_instances) for one in run.result.submits if one.submit_index <= group.submit_index
-        )
+        before = [one for one in run.result.submits if one.submit_index <= group.submit_index]
         cases = Cases(
             split=group.split,
             submit_index=group.submit_index,
             env_instances=ids,
             modulo=len(train) or len(ids),
-            remaining_budget_after=run.opening.budget - used,
+            remaining_budget_after=run.opening.budget - sum(len(one.env_instances) for one in before),
         )
-        found.append(Chosen(run, group, cases, indexes))
-    return found
+        chosen.append(Chosen(run, group, cases, indexes))
+    return chosen
 
 
 @contextlib.asynccontextmanager
@@ -344,7 +340,7 @@ async def unplayable(evaluations: Evaluations, run: PublishedRun) -> tuple[str, 
     versions. Empty where they can. And whether the processor's features differ from those in the run."""
     env, known = run.opening.settings.env, run.record.versions.fingerprint
     try:
-        state = await evaluations.versions(DescribeEnvironment(token="", env=env), wait=True)
+        state = await evaluations.versions(DescribeEnvironment(env=env))
     except BrokenEnvironmentError as error:
         return str(error), False
     if not state.fingerprints:

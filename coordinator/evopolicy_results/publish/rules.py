@@ -10,7 +10,8 @@ Rules that this module owns:
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import TypeVar
 
 from evopolicy_common.errors import ProtocolError
 from evopolicy_common.records import journal
@@ -21,9 +22,11 @@ from evopolicy_common.terminal import counted
 from evopolicy_results.publish import card as cards
 from evopolicy_results.publish import contents, descriptions, fields
 from evopolicy_results.publish.contents import Countersignature, Manifest, Removed, Signature
-from evopolicy_results.publish.findings import KINDS, Checked, Files, History, State, decoded
-from evopolicy_results.publish.run_rules import UPDATE, check_run, read_run, refuse_unknown
+from evopolicy_results.publish.findings import KINDS, UPDATE, Checked, Files, History, State, decoded
+from evopolicy_results.publish.run_rules import check_run, read_run
 from evopolicy_results.publish.signatures import HEAD, signed_by
+
+T = TypeVar("T")
 
 
 def check(files: Files, identity: str = "", heads: Sequence[str | Countersignature] = ()) -> Checked:
@@ -41,7 +44,10 @@ def check(files: Files, identity: str = "", heads: Sequence[str | Countersignatu
     entries = _journal(files, manifest, checked)
     for state, text in _order(entries, heads, checked.signer):
         checked.add("order", state, text)
-    _removed(files, checked)
+    try:
+        checked.removed = _document(files, contents.REMOVED, tuple[Removed, ...], checked)
+    except ProtocolError as error:
+        checked.add("format", "failed", str(error))
     folders = sorted({"/".join(name.split("/")[:2]) for name in files.names if name.startswith("runs/")})
     if len(folders) > contents.MAX_RUNS:
         checked.add("format", "failed", f"{len(folders):,} runs; {contents.MAX_RUNS:,} are allowed")
@@ -65,53 +71,53 @@ def check(files: Files, identity: str = "", heads: Sequence[str | Countersignatu
     is_whole = all(each.state == "published" for each in checked.listing)
     checked.add("completeness", "ok" if is_whole else "open", contents.completeness(checked.listing))
     _descriptions(files, manifest, digests, checked)
-    _claims(checked)
+    for file, names in checked.claims.items():
+        kind = fields.file_kind(file) or file
+        by = next((run.opening.run for run in checked.runs if file.startswith(f"{run.folder}/")), "")
+        text = f"nobody can check, in {kind.removeprefix('runs/*/')}: {', '.join(names)}"
+        checked.add("claims", "open", text, by)
     return checked
 
 
 def _manifest(files: Files, identity: str, checked: Checked) -> Manifest | None:
     try:
-        data = files.read(contents.MANIFEST, contents.MAX_DOCUMENT_BYTES)
-        manifest = decoded(contents.MANIFEST, data, Manifest)
-        by = files.read(contents.SIGNATURE, 4096)
-        signature = decoded(contents.SIGNATURE, by, Signature)
-        if contents.document(signature) != by:
-            raise ProtocolError(f"{contents.SIGNATURE} is not written as the software writes it")
+        manifest = _document(files, contents.MANIFEST, Manifest, checked)
+        signature = _document(files, contents.SIGNATURE, Signature, checked)
+        if (manifest.format, manifest.version) != (contents.FORMAT, contents.VERSION):
+            raise ProtocolError(
+                f"{manifest.format[:40]!r} version {manifest.version}; this program reads {contents.FORMAT!r}"
+                f" version {contents.VERSION}"
+            )
+        if manifest.canary != CANARY:
+            raise ProtocolError("the manifest has another canary")
     except ProtocolError as error:
         checked.add("format", "failed", str(error))
         return None
-    fault = ""
-    if (manifest.format, manifest.version) != (contents.FORMAT, contents.VERSION):
-        fault = (
-            f"{manifest.format[:40]!r} version {manifest.version}; this program reads {contents.FORMAT!r}"
-            f" version {contents.VERSION}"
-        )
-    elif data != contents.document(manifest) or manifest.canary != CANARY:
-        fault = (
-            "the manifest is not written as the software writes it: a field is added or doubled, or another"
-            " canary"
-        )
-    if fault:
-        checked.add("format", "failed", fault)
-        return None
-    checked.claim(contents.MANIFEST, ["software"])
     checked.add("format", "ok", f"version {manifest.version}, made by evopolicy {manifest.software}")
-    if not signed_by(signature.key, signature.signature, contents.digest(data)):
+    signed = contents.digest(files.read(contents.MANIFEST, contents.MAX_DOCUMENT_BYTES))
+    if not signed_by(signature.key, signature.signature, signed):
         checked.add("signature", "failed", f"not a signature of this manifest by {signature.key[:64]}")
         return manifest
     checked.signer = signature.key
     checked.add("signature", "ok", f"signed by {signature.key}")
-    state: State = "failed"
-    text = f"another signer: {signature.key}, not {identity}"
     if not identity:
-        state = "open"
         text = (
             "self-signed: whoever made the file chose the key. Name the key that you expect with --identity"
         )
+        checked.add("identity", "open", text)
     elif signature.key == identity.lower():
-        state, text = "ok", "signed by the key that you named"
-    checked.add("identity", state, text)
+        checked.add("identity", "ok", "signed by the key that you named")
+    else:
+        checked.add("identity", "failed", f"another signer: {signature.key}, not {identity}")
     return manifest
+
+
+def _document(files: Files, name: str, kind: Callable[..., T] | type[T], checked: Checked) -> T:
+    """A file's content. Raises ProtocolError for a damaged one. `checked` receives its unknown fields and claims."""
+    data = files.read(name, contents.MAX_DOCUMENT_BYTES)
+    content = decoded(name, data, kind)
+    checked.refuse_unknown(name, fields.parsed(name, data), {})
+    return content
 
 
 def _names(files: Files, manifest: Manifest, checked: Checked) -> None:
@@ -124,14 +130,12 @@ def _names(files: Files, manifest: Manifest, checked: Checked) -> None:
 
 
 def _digests(files: Files, manifest: Manifest, checked: Checked) -> tuple[set[str], dict[str, str]]:
-    """The names of files that are not what was signed, and the signed digests of all."""
+    """The names of files that differ from those that were signed, and the signed digests of all."""
     wanted = dict(manifest.files)
     bad: list[str] = []
     for name in [name for name in manifest.files if name.endswith(f"/{contents.DIGESTS}")]:
         try:
-            data = files.read(name, contents.MAX_DOCUMENT_BYTES)
-            inner = decoded(name, data, dict[str, str])
-            fields.parsed(name, data)
+            inner = _document(files, name, dict[str, str], checked)
         except ProtocolError as error:
             bad.append(str(error))
             continue
@@ -142,12 +146,11 @@ def _digests(files: Files, manifest: Manifest, checked: Checked) -> tuple[set[st
     for name in sorted(wanted.keys() & files.names):
         try:
             actual = contents.digest(files.read(name, contents.MAX_RECORDING_BYTES))
+            fault = f"{name} was changed" if actual != wanted[name] else ""
         except ProtocolError as error:
-            bad.append(str(error))
-            damaged.add(name)
-            continue
-        if actual != wanted[name]:
-            bad.append(f"{name} was changed")
+            fault = str(error)
+        if fault:
+            bad.append(fault)
             damaged.add(name)
     bad += [f"{name} is missing" for name in sorted(expected - files.names)]
     bad += [f"{name} was added" for name in sorted(files.names - expected)]
@@ -223,23 +226,13 @@ def _history_fault(entries: Sequence[journal.Entry]) -> str | None:
     return None
 
 
-def _removed(files: Files, checked: Checked) -> None:
-    try:
-        data = files.read(contents.REMOVED, contents.MAX_DOCUMENT_BYTES)
-        checked.removed = decoded(contents.REMOVED, data, tuple[Removed, ...])
-        refuse_unknown(contents.REMOVED, fields.parsed(contents.REMOVED, data), {}, checked)
-    except ProtocolError as error:
-        checked.add("format", "failed", str(error))
-
-
 def _descriptions(files: Files, manifest: Manifest, digests: Mapping[str, str], checked: Checked) -> None:
     """Makes the card and its descriptions again, and compares. Files of earlier versions have none."""
     if checked.failed or not files.names.intersection(contents.DESCRIPTIONS):
         return
     try:
         data = {name: files.read(name, contents.MAX_DOCUMENT_BYTES) for name in contents.DESCRIPTIONS}
-        card = decoded(contents.CARD, data[contents.CARD], cards.Card)
-        refuse_unknown(contents.CARD, fields.parsed(contents.CARD, data[contents.CARD]), {}, checked)
+        card = _document(files, contents.CARD, cards.Card, checked)
     except ProtocolError as error:
         checked.add("card", "failed", str(error))
         return
@@ -260,11 +253,3 @@ def _descriptions(files: Files, manifest: Manifest, digests: Mapping[str, str], 
     made = descriptions.files(cards.matching(own, card), digests)
     wrong = [f"{name} is not what follows from the runs" for name in made if made[name] != data[name]]
     checked.conclude("card", wrong, KINDS["card"])
-
-
-def _claims(checked: Checked) -> None:
-    for file, found in checked.claims.items():
-        kind = fields.file_kind(file) or file
-        run = next((run.opening.run for run in checked.runs if file.startswith(f"{run.folder}/")), "")
-        text = f"nobody can check, in {kind.removeprefix('runs/*/')}: {', '.join(found)}"
-        checked.add("claims", "open", text, run)

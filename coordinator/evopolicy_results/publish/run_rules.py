@@ -1,23 +1,22 @@
 """The rules of `evopolicy check` for one run: its documents against the journal, against each other, and against its
-recordings."""
+recordings; and the search of its checkpoints and log for signals, which is never `failed`."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from itertools import zip_longest
-from typing import Any, TypeVar
+from typing import Any
 
 import msgspec
 
 from evopolicy_common import catalogue
-from evopolicy_common.errors import BundleError, ProtocolError
+from evopolicy_common.errors import ProtocolError
 from evopolicy_common.records import journal
 from evopolicy_common.records.aggregates import best_validated, mean
 from evopolicy_common.records.code_metrics import TREND, code_metrics
 from evopolicy_common.records.episodes.compare import same
 from evopolicy_common.records.episodes.trajectory import Trajectory, decode
 from evopolicy_common.records.journal import Ended, Opened, Opening, Result, Revealed
-from evopolicy_common.records.policies import bundles
 from evopolicy_common.records.policies.bundles import Bundle
 from evopolicy_common.records.run_record import PROTOCOL_VERSION, decode_run_record, inputs_digest
 from evopolicy_common.records.splits import FILE_STEMS, SPLITS, cases_hash, overlaps
@@ -26,45 +25,34 @@ from evopolicy_common.terminal import counted
 from evopolicy_results.publish import contents, fields
 from evopolicy_results.publish.contents import Group
 from evopolicy_results.publish.findings import KINDS, Checked, Fault, Files, History, PublishedRun, decoded
+from evopolicy_results.scan.run import scan
+from evopolicy_results.scan.signals import TITLES, Signal
 from evopolicy_results.verify.numbers import outcome_pairs, short
 
-T = TypeVar("T")
-
 _SHOWN = 8
-"""Unknown fields of a file that become findings."""
+"""Signals of a run that become findings."""
 _BY_SUBMIT = "code_metrics_by_submit"
 _PARSED = "classes functions imports import_count cyclomatic_total cyclomatic_max parse_errors"
 """Metrics of code that rest on Python's parser."""
-UPDATE = "it was added, or a later version of evopolicy wrote it (then update)"
-
-
-def refuse_unknown(name: str, value: Any, committed: dict[str, Any], checked: Checked, run: str = "") -> None:
-    """Refuses fields that the table of `fields` does not name, and notes those that are claims."""
-    unknown, claims = fields.unknown_and_claims(name, value, committed)
-    for field in unknown[:_SHOWN]:
-        text = f"{name}: {field[:120]} is no field of published results: {UPDATE}"
-        checked.add("format", "failed", text, run)
-    checked.claim(name, claims)
+_DOCUMENTS = (contents.OPENING, contents.RESULT, contents.EPISODES, contents.RUN)
 
 
 def read_run(files: Files, folder: str, checked: Checked) -> PublishedRun | None:
-    data, content = {}, {}
+    place = {name: f"{folder}/{name}" for name in (*_DOCUMENTS, contents.SALT)}
     try:
-        for name in (contents.OPENING, contents.RESULT, contents.EPISODES, contents.RUN, contents.SALT):
-            data[name] = files.read(f"{folder}/{name}", contents.MAX_DOCUMENT_BYTES)
-            if name != contents.SALT:
-                content[name] = fields.parsed(f"{folder}/{name}", data[name])
+        data = {name: files.read(path, contents.MAX_DOCUMENT_BYTES) for name, path in place.items()}
+        written = {name: fields.parsed(place[name], data[name]) for name in _DOCUMENTS}
         salt = data[contents.SALT].decode("ascii", "replace")
         run = PublishedRun(
             folder=folder,
             record=decode_run_record(data[contents.RUN]),
-            opening=decoded(f"{folder}/{contents.OPENING}", data[contents.OPENING], Opening),
+            opening=decoded(place[contents.OPENING], data[contents.OPENING], Opening),
             salt=bytes.fromhex(salt),
-            result=decoded(f"{folder}/{contents.RESULT}", data[contents.RESULT], Result),
-            groups=decoded(f"{folder}/{contents.EPISODES}", data[contents.EPISODES], tuple[Group, ...]),
+            result=decoded(place[contents.RESULT], data[contents.RESULT], Result),
+            groups=decoded(place[contents.EPISODES], data[contents.EPISODES], tuple[Group, ...]),
             opening_bytes=data[contents.OPENING],
             result_bytes=data[contents.RESULT],
-            as_written=content[contents.RUN],
+            as_written=written[contents.RUN],
         )
         if salt != run.salt.hex():
             raise ProtocolError("its salt is not written as the software writes it")
@@ -72,17 +60,17 @@ def read_run(files: Files, folder: str, checked: Checked) -> PublishedRun | None
         checked.add("format", "failed", f"{folder}: {error}", folder)
         return None
     for name in (contents.EPISODES, contents.RUN):
-        refuse_unknown(f"{folder}/{name}", content[name], run.result.record, checked, run.opening.run)
+        checked.refuse_unknown(place[name], written[name], run.result.record, run.opening.run)
     return run
 
 
 def check_run(files: Files, run: PublishedRun, history: History, damaged: set[str], checked: Checked) -> None:
     name = run.opening.run
     for kind, rule in _RULES.items():
-        found = [each if isinstance(each, Fault) else Fault(kind, each) for each in rule(run, history)]
-        for fault in found:
+        faults = [each if isinstance(each, Fault) else Fault(kind, each) for each in rule(run, history)]
+        for fault in faults:
             checked.add(fault.kind, "failed", fault.text, name)
-        if not found:
+        if not faults:
             checked.add(kind, "ok", KINDS[kind], name)
     _recordings(files, run, damaged, checked)
     _checkpoints(files, run, damaged, checked)
@@ -92,16 +80,9 @@ def check_run(files: Files, run: PublishedRun, history: History, damaged: set[st
     checked.add("policies", "open", text, name)
 
 
-def _entry(history: History, kind: type[T], run: str) -> tuple[int, T] | None:
-    for number, entry in enumerate(history.entries):
-        if isinstance(entry, kind) and getattr(entry, "run", None) == run:
-            return number, entry
-    return None
-
-
 def _commitment(run: PublishedRun, history: History) -> Iterator[str | Fault]:
     opening, settings, place = run.opening, run.opening.settings, run.record.committed
-    numbered = _entry(history, Opened, opening.run)
+    numbered = history.entry(Opened, opening.run)
     if numbered is None:
         yield Fault("journal", "the journal has no entry of this run")
         return
@@ -129,7 +110,7 @@ def _disclosure(run: PublishedRun, history: History) -> Iterator[str]:
 
 
 def _result(run: PublishedRun, history: History) -> Iterator[str | Fault]:
-    numbered, place = _entry(history, Ended, run.opening.run), run.record.committed
+    numbered, place = history.entry(Ended, run.opening.run), run.record.committed
     if numbered is None:
         yield "the journal has no end of this run"
         return
@@ -154,6 +135,8 @@ def _record(run: PublishedRun, history: History) -> Iterator[str]:
     """`run.json`, compared with the committed documents."""
     record, opening, result = run.record, run.opening, run.result
     settings, dimensions, agent = opening.settings, record.experiment_dimensions, record.agent
+    # A run that ended before it had a workspace tells no counts.
+    staged = dimensions.n_train > 0 or bool(result.submits)
     pairs: list[tuple[str, Any, Any]] = [
         ("protocol_version", record.protocol_version, PROTOCOL_VERSION),
         ("run", record.run, opening.run),
@@ -164,12 +147,10 @@ def _record(run: PublishedRun, history: History) -> Iterator[str]:
         ("episode_budget", dimensions.episode_budget, opening.budget),
         ("trees", record.trees, {str(one.submit_index): one.tree for one in result.submits if one.tree}),
         ("versions.data_secret", record.versions.data_secret, opening.cases_secret),
+        ("n_train", dimensions.n_train, staged * len(opening.train)),
     ]
     for part, names in ((record, _RECORD_AS_SET), (dimensions, _DIMENSIONS_AS_SET)):
         pairs += [(name, getattr(part, name), getattr(settings, name)) for name in names.split()]
-    # A run that ended before it had a workspace tells no counts.
-    staged = dimensions.n_train > 0 or bool(result.submits)
-    pairs.append(("n_train", dimensions.n_train, staged * len(opening.train)))
     for name in ("min_episodes_per_submit", "max_episodes_per_submit"):
         pairs.append((name, getattr(dimensions, name), staged * getattr(opening, name)))
     suite = catalogue.suite_of(settings.env) if catalogue.is_shipped(settings.env) else catalogue.OTHER
@@ -183,7 +164,7 @@ def _record(run: PublishedRun, history: History) -> Iterator[str]:
             pairs.append((path, here, fixed))
     if not result.random_heldout_returns:
         pairs.append(("outcome.random_reference", record.outcome.random_reference, None))
-    began, over = _entry(history, Opened, opening.run), _entry(history, Ended, opening.run)
+    began, over = history.entry(Opened, opening.run), history.entry(Ended, opening.run)
     if began is not None and over is not None:
         start, end, timing = began[1].at, over[1].at, record.timing
         pairs += [
@@ -194,13 +175,14 @@ def _record(run: PublishedRun, history: History) -> Iterator[str]:
     for split in SPLITS:
         ours = f"sha256:{cases_hash(run.cases(split))}"
         pairs.append((f"the hash of the {FILE_STEMS[split]} cases", record.versions.cases_hash(split), ours))
-    for source, told in (
-        ("committed to was", pairs),
-        ("what came of the run is", outcome_pairs(record.outcome, result)),
-    ):
-        for name, here, fixed in told:
-            if here != fixed:
-                yield f"run.json tells {name} {short(here)}; {source} {short(fixed)}"
+    yield from _unlike(pairs, "committed to was")
+    yield from _unlike(outcome_pairs(record.outcome, result), "what came of the run is")
+
+
+def _unlike(told: Iterable[tuple[str, Any, Any]], source: str) -> Iterator[str]:
+    for name, here, fixed in told:
+        if here != fixed:
+            yield f"run.json tells {name} {short(here)}; {source} {short(fixed)}"
 
 
 def _budget(run: PublishedRun, history: History) -> Iterator[str]:
@@ -237,16 +219,18 @@ def _selection(run: PublishedRun, history: History) -> Iterator[str]:
 
 def _scores(run: PublishedRun, history: History) -> Iterator[str]:
     result, opening = run.result, run.opening
-    if len({group.name for group in run.groups}) != len(run.groups):
+    groups = {group.name: group for group in run.groups}
+    if len(groups) != len(run.groups):
         yield "a list of episodes occurs twice"
-    wanted_groups = contents.wanted_groups(result)
-    wanted_names = [contents.group_name(split, index) for split, index, _ in wanted_groups]
-    if odd := [group.name for group in run.groups if group.name not in wanted_names]:
+    wanted_groups = {
+        contents.group_name(split, index): (split, index, n)
+        for split, index, n in contents.wanted_groups(result)
+    }
+    if odd := [name for name in groups if name not in wanted_groups]:
         yield f"the result has no episodes of {odd[0]}"
-    groups = {(group.split, group.submit_index): group for group in run.groups}
     submits = {submit.submit_index: submit for submit in result.submits}
-    for name, (split, index, n) in zip(wanted_names, wanted_groups, strict=True):
-        group = groups.get((split, index))
+    for name, (split, index, n) in wanted_groups.items():
+        group = groups.get(name)
         if group is None:
             yield f"the episodes of {name} are not there"
             continue
@@ -264,11 +248,12 @@ def _scores(run: PublishedRun, history: History) -> Iterator[str]:
             told = submit.mean_return if split == "train" else submit.val_mean
             if returns and mean(returns) != told:
                 yield f"the returns of {name} have the mean {mean(returns)!r}, not {told!r}"
-    for split in ("validation", "heldout"):
-        best = groups.get((split, -2 if result.best_submit_index is None else result.best_submit_index))
-        failed = 0 if best is None else sum(episode.failure != "" for episode in best.episodes)
-        if best is not None and failed != result.policy_failures.get(split, 0):
-            yield f"{best.name} has {failed} failures of the policy, which the result does not tell"
+    if (best := result.best_submit_index) is not None:
+        for split in ("validation", "heldout"):
+            group = groups.get(contents.group_name(split, best))
+            failed = sum(episode.failure != "" for episode in group.episodes) if group else 0
+            if group and failed != result.policy_failures.get(split, 0):
+                yield f"{group.name} has {failed} failures of the policy, which the result does not tell"
     if result.status == "completed":
         n_heldout = len(result.heldout_returns)
         if n_heldout != len(opening.heldout) or result.final_score != mean(result.heldout_returns):
@@ -288,24 +273,25 @@ _RULES: dict[str, Callable[[PublishedRun, History], Iterator[str | Fault]]] = {
 
 
 def _recordings(files: Files, run: PublishedRun, damaged: set[str], checked: Checked) -> None:
-    name, lists = run.opening.run, f"{run.folder}/actions/"
+    lists = f"{run.folder}/actions/"
     recorded: dict[str, tuple[int, int]] = {}
-    there = {each for each in files.names if each.startswith(lists)}
-    faults = [
-        f"{path} is of no list of episodes" for path in sorted(there - {lists + g.name for g in run.groups})
-    ]
+    checked.recorded[run.opening.run] = recorded
+    paths = {each for each in files.names if each.startswith(lists)}
+    odd = sorted(paths - {lists + group.name for group in run.groups})
+    faults = [f"{path} is of no list of episodes" for path in odd]
+    paths -= damaged
     for number, group in enumerate(run.groups):
         # The result has the returns of held-out episodes.
         claimed = ["length"] if group.split == "heldout" else ["length", "episode_return"]
         recordings: list[bytes | None] = []
-        if lists + group.name not in damaged:
+        if lists + group.name in paths:
             try:
                 recordings = run.recordings(files, group.name)
-                if lists + group.name in there and len(recordings) != len(group.episodes):
-                    raise ProtocolError(f"{len(recordings)} recordings")
+                if len(recordings) != len(group.episodes):
+                    faults.append(f"{group.name}: {len(recordings)} recordings")
+                    recordings = []
             except ProtocolError as error:
                 faults.append(f"{group.name}: {error}")
-                recordings = []
         n, of = recorded.get(group.part, (0, 0))
         recorded[group.part] = n + sum(each is not None for each in recordings), of + len(group.episodes)
         for position, (episode, data) in enumerate(zip_longest(group.episodes, recordings)):
@@ -314,13 +300,12 @@ def _recordings(files: Files, run: PublishedRun, damaged: set[str], checked: Che
                 checked.claim(f"{run.folder}/{contents.EPISODES}", (f"{place}.{field}" for field in claimed))
             elif fault := recording_fault(episode, data):
                 faults.append(f"{group.name}, episode {episode.index}: {fault}")
-    checked.recorded[name] = recorded
-    left = ""
-    if missing := checked.unrecorded(name):
-        left = f"only {', '.join(missing)} episodes have a recording"
-        left += ": the other returns rest on the publisher's word"
+    open_text = ""
+    if missing := checked.unrecorded(run.opening.run):
+        open_text = f"only {', '.join(missing)} episodes have a recording"
+        open_text += ": the other returns rest on the publisher's word"
     episodes = counted(sum(n for n, _ in recorded.values()), "episode")
-    checked.conclude("recordings", faults, episodes, name, left)
+    checked.conclude("recordings", faults, episodes, run.opening.run, open_text)
 
 
 def recording_fault(episode: contents.Episode, data: bytes) -> str | None:
@@ -340,10 +325,10 @@ def recording_fault(episode: contents.Episode, data: bytes) -> str | None:
 def recording_of(data: bytes) -> Trajectory:
     """A published recording. Raises ProtocolError for other bytes, and for a recording of more than actions and
     rewards."""
-    found = decode(data, contents.MAX_EPISODE_BYTES)
-    if found.record != "actions":
+    recording = decode(data, contents.MAX_EPISODE_BYTES)
+    if recording.record != "actions":
         raise ProtocolError("it holds more than actions and rewards")
-    return found
+    return recording
 
 
 def return_of(recording: Trajectory) -> float:
@@ -355,27 +340,23 @@ def return_of(recording: Trajectory) -> float:
 
 
 def _checkpoints(files: Files, run: PublishedRun, damaged: set[str], checked: Checked) -> None:
-    name, withheld, folder = run.opening.run, 0, f"{run.folder}/"
-    places = {
-        folder + contents.checkpoint_path(one.submit_index): one for one in run.result.submits if one.bundle
-    }
-    odd = sorted(path for path in files.names - places.keys() if path.startswith(f"{folder}checkpoints/"))
+    folder = f"{run.folder}/"
+    places = {folder + contents.checkpoint_path(one.submit_index) for one in run.result.submits if one.bundle}
+    odd = sorted(path for path in files.names - places if path.startswith(f"{folder}checkpoints/"))
     faults = [f"{path} is the policy of no submit" for path in odd]
     policies: dict[int, Bundle] = {}
-    for path, submit in places.items():
-        if path not in files.names or path in damaged:
+    withheld = 0
+    for index, policy in run.policies(files, damaged):
+        if isinstance(policy, Bundle):
+            policies[index] = policy
+        elif policy:
+            faults.append(f"submit {index}: another policy than the one that was submitted: {policy}")
+        else:
             withheld += 1
-            continue
-        try:
-            data = files.read(path, contents.MAX_DOCUMENT_BYTES * 2)
-            policies[submit.submit_index] = bundles.load(data, submit.bundle or "")
-        except (BundleError, ProtocolError) as error:
-            text = f"submit {submit.submit_index}: another policy than the one that was submitted: {error}"
-            faults.append(text)
-    left = f"{withheld} policies were withheld" if withheld else ""
-    checked.conclude("checkpoints", faults, f"{len(policies)} policies", name, left)
-    for text in _metrics(run, policies, checked):
-        checked.add("record", "failed", text, name)
+    text = f"{withheld} policies were withheld" if withheld else ""
+    checked.conclude("checkpoints", faults, f"{len(policies)} policies", run.opening.run, text)
+    for fault in _metrics(run, policies, checked):
+        checked.add("record", "failed", fault, run.opening.run)
 
 
 def _metrics(run: PublishedRun, policies: dict[int, Bundle], checked: Checked) -> Iterator[str]:
@@ -383,8 +364,8 @@ def _metrics(run: PublishedRun, policies: dict[int, Bundle], checked: Checked) -
     told = run.record.outcome.auxiliary
     if not told.keys() & {_BY_SUBMIT, "code_metrics_best", "code_metrics_trend"}:
         return  # a run of an early version
-    by_submit = told.get(_BY_SUBMIT, {})
-    best = run.record.outcome.best_submit_index
+    by_submit, best = told.get(_BY_SUBMIT, {}), run.record.outcome.best_submit_index
+    file = f"{run.folder}/{contents.RUN}"
     try:
         trend = {name: [each[name] for each in by_submit.values()] for name in TREND}
         trend["submits"] = list(map(int, by_submit))
@@ -396,12 +377,12 @@ def _metrics(run: PublishedRun, policies: dict[int, Bundle], checked: Checked) -
         for index, here in by_submit.items():
             where = f"outcome.auxiliary.{_BY_SUBMIT}.{index}"
             if (policy := policies.get(int(index))) is None:
-                checked.claim(f"{run.folder}/{contents.RUN}", [f"{where}.**"])
+                checked.claim(file, [f"{where}.**"])
                 continue
             own = msgspec.to_builtins(code_metrics({file.path: file.data for file in policy.files}))
             # Versions of Python differ in what they can parse.
             parsed = () if own["parse_errors"] == tuple(here["parse_errors"]) else _PARSED.split()
-            checked.claim(f"{run.folder}/{contents.RUN}", [f"{where}.{name}" for name in parsed])
+            checked.claim(file, [f"{where}.{name}" for name in parsed])
             pairs += [(where, here.get(name), value) for name, value in own.items() if name not in parsed]
             pairs.append((where, sorted(here), sorted(own)))
     except (AttributeError, KeyError, TypeError, ValueError):
@@ -410,3 +391,37 @@ def _metrics(run: PublishedRun, policies: dict[int, Bundle], checked: Checked) -
     for name, here, fixed in pairs:
         if contents.document(here) != contents.document(fixed):
             yield f"run.json tells {name} {short(here)}; the policies give {short(fixed)}"
+
+
+def scan_published(files: Files, checked: Checked) -> None:
+    """Adds a finding for each place in checkpoints and logs that a person should read, or one `ok` for a run without
+    any."""
+    for run in checked.runs:
+        name = run.opening.run
+        try:
+            signals = [
+                f"{TITLES[one.kind]}: {one.path}: {one.reason}: {one.quote}" for one in _signals(files, run)
+            ]
+        except ProtocolError as error:
+            checked.add("signals", "open", f"not searched: {error}", name)
+            continue
+        if len(signals) > _SHOWN:
+            signals[_SHOWN:] = [f"{len(signals) - _SHOWN} more signals"]
+        for text in signals:
+            checked.add("signals", "open", text, name)
+        if not signals:
+            checked.add("signals", "ok", "no signal", name)
+
+
+def _signals(files: Files, run: PublishedRun) -> tuple[Signal, ...]:
+    log = f"{run.folder}/{contents.LOG}"
+    lines = files.read(log, contents.MAX_DOCUMENT_BYTES).splitlines() if log in files.names else ()
+
+    def trajectories(index: int) -> Iterator[list[object]]:
+        for data in run.recordings(files, contents.group_name("train", index)):
+            if data is not None:
+                yield list(recording_of(data).actions)
+
+    policies = run.bundles(files).items()
+    checkpoints = ((index, {file.path: file.data for file in bundle.files}) for index, bundle in policies)
+    return scan(checkpoints, lines, trajectories)

@@ -80,13 +80,13 @@ def needles(
 ) -> tuple[Needle, ...]:
     """The search terms: values of environment variables, names of users and hosts (each with its kind), folders,
     secrets."""
-    found: dict[bytes, str] = {}
+    kinds: dict[bytes, str] = {}
 
     def add(text: str, what: str, least: int) -> None:
         if len(text) >= least and text.casefold() not in _NOBODY:
-            found.setdefault(text.encode("utf-8", "surrogateescape"), what)
+            kinds.setdefault(text.encode("utf-8", "surrogateescape"), what)
             # As JSON spells it, in a log of JSON lines.
-            found.setdefault(json.dumps(text)[1:-1].encode("ascii"), what)
+            kinds.setdefault(json.dumps(text)[1:-1].encode("ascii"), what)
 
     for secret in secrets:
         add(secret, "a token or password of the cluster", _MIN_NEEDLE)
@@ -102,15 +102,14 @@ def needles(
             if part.startswith("/") and (part.count("/") < 2 or _SYSTEM_PATH.match(part)):
                 continue
             add(part, f"the value of the environment variable {name}", 8)
-    return tuple(Needle(text, what) for text, what in sorted(found.items()))
+    return tuple(Needle(text, what) for text, what in sorted(kinds.items()))
 
 
 def search(data: bytes, needles: Iterable[Needle]) -> list[str]:
     """The kinds of terms of this machine in `data`, without their texts; a name counts only if no letter or digit
     adjoins it."""
-    found = ["a home folder"] if _HOME.search(data) else []
-    found += [needle.what for needle in needles if next(_places(data, needle.text), None) is not None]
-    return found
+    kinds = ["a home folder"] if _HOME.search(data) else []
+    return kinds + [each.what for each in needles if next(_places(data, each.text), None) is not None]
 
 
 def secret_lines(data: bytes, passed: Passed | None) -> dict[int, str]:
@@ -129,7 +128,7 @@ REDACTED = b"[removed]"
 def redact(
     data: bytes, needles: Iterable[Needle], passed: Passed | None = None
 ) -> tuple[bytes, dict[str, int]]:
-    """`data` with everything replaced that the searches would find, and how often each kind was."""
+    """`data` with every match of the searches replaced, and the number of replacements by kind."""
     counts: dict[str, int] = {}
     if passed is not None:
         data, counts[secrets.PASSED_VALUE] = secrets.replaced(data, passed.places(data), REDACTED)

@@ -35,7 +35,7 @@ from evopolicy_common.records.rescores import (
     read_rescore,
     rescore_path,
 )
-from evopolicy_common.records.run_files import RUN_JSON, read_record
+from evopolicy_common.records.run_files import read_or_reason
 from evopolicy_common.records.run_record import RunRecord
 from evopolicy_common.records.splits import FILE_STEMS, cases_hash, folder_of, read_split_file
 from evopolicy_common.records.words import in_words
@@ -90,25 +90,19 @@ class Written(msgspec.Struct, frozen=True, kw_only=True):
 def read_finished(folders: Sequence[Path]) -> tuple[list[Finished], list[str], list[str]]:
     """The runs in these directories, those without anything to re-score, and damaged or unfinished ones; with
     reasons."""
-    found, without, unreadable = [], [], []
+    finished, without, unreadable = [], [], []
     for folder in folders:
-        try:
-            record = read_record(folder)
-        except FileNotFoundError:
-            unreadable.append(f"{folder} has no run.json: the run is not finished; re-score it when it is")
-            continue
-        except (OSError, ProtocolError) as error:
-            why = f" cannot be read: {error.strerror}" if isinstance(error, OSError) else f": {error}"
-            unreadable.append(f"{folder / RUN_JSON}{why}")
-            continue
-        best = record.outcome.best_submit_index
-        if record.outcome.status != "completed" or best is None:
+        record = read_or_reason(folder)
+        if isinstance(record, str):
+            unreadable.append(f"{folder}: {record}")
+        elif record.outcome.status != "completed" or record.outcome.best_submit_index is None:
             without.append(f"{folder}: {in_words(record.outcome.status)}, without a selected checkpoint")
         elif not record.run:
             without.append(f"{folder}: an earlier version wrote it without the coordinator's name of the run")
         else:
-            found.append(Finished(folder=folder, record=record, selected=best))
-    return found, without, unreadable
+            selected = record.outcome.best_submit_index
+            finished.append(Finished(folder=folder, record=record, selected=selected))
+    return finished, without, unreadable
 
 
 async def rescore(run: Finished, wanted: Wanted, evaluations: Evaluations) -> Written:
@@ -155,7 +149,7 @@ async def _rescore(run: Finished, wanted: Wanted, evaluations: Evaluations) -> W
             if index != RANDOM:
                 bundle = bundle_of(checkpoint_folder(run.folder, "checkpoints", index))
                 await evaluations.ask.upload(bundle.digest, bundle.packed)
-        played = await _play(record, index, cases, digest, fingerprint_class, evaluations)
+        played = await _play(record, index, cases, fingerprint_class, evaluations)
         if index == RANDOM:
             result = msgspec.structs.replace(result, random_returns=played.returns)
             continue
@@ -166,15 +160,15 @@ async def _rescore(run: Finished, wanted: Wanted, evaluations: Evaluations) -> W
         )
         path.parent.mkdir(exist_ok=True)
         write_atomically(path, encode_rescore(result))
-    selected = result.checkpoint(run.selected)
+    selected, score = result.checkpoint(run.selected), record.outcome.score
     assert selected is not None
-    assert record.outcome.score is not None
+    assert score is not None
     return Written(
         run=record.run,
         path=str(path),
         env=record.env,
         entry=record.agent.entry,
-        score=record.outcome.score,
+        score=score,
         rescored=selected.mean,
         episodes=evaluations.played - began,
     )
@@ -182,20 +176,17 @@ async def _rescore(run: Finished, wanted: Wanted, evaluations: Evaluations) -> W
 
 async def class_of(record: RunRecord, evaluations: Evaluations) -> str:
     """The fingerprint class of workers with the run's versions. Raises ConfigError when there are none."""
-    message = DescribeEnvironment(token="", env=record.env, run=record.run)
-    # The first worker of a cluster of the command's own may still be starting.
-    state = await evaluations.versions(message, wait=evaluations.ask.own)
+    message = DescribeEnvironment(env=record.env, run=record.run)
+    state = await evaluations.versions(message)
     if not state.knows_run:
         raise ConfigError(
             f"this cluster's coordinator has no finished run {record.run}: it is still open there, or another one"
             " played it; use that one (--connect, or --local with its --state)"
         )
     if not state.fingerprints:
-        own, other = (
-            f"`evopolicy-worker check-env {record.env}` tells why",
-            f"start one with --env {record.env}",
-        )
-        remedy = own if evaluations.ask.own else other
+        remedy = f"start one with --env {record.env}"
+        if evaluations.ask.own:
+            remedy = f"`evopolicy-worker check-env {record.env}` tells why"
         raise ConfigError(f"no worker of this cluster offers {record.env}; {remedy}")
     differences: list[str] = []
     for number, fingerprint in enumerate(state.fingerprints):
@@ -218,8 +209,8 @@ async def _cases(
     """The cases, whether they are secret, and the epoch of their secret."""
     if wanted.data is None:
         assert wanted.n_cases is not None
-        found = await evaluations.ask.further_cases(record.run, wanted.name, wanted.n_cases)
-        return found.cases, True, found.epoch
+        further = await evaluations.ask.further_cases(record.run, wanted.name, wanted.n_cases)
+        return further.cases, True, further.epoch
     path = folder_of(wanted.data, record.env) / f"{FILE_STEMS['heldout']}.json"
     content, _ = read_split_file(path)
     if content.env != record.env:
@@ -231,25 +222,19 @@ async def _cases(
 
 
 async def _play(
-    record: RunRecord,
-    index: int,
-    cases: tuple[Case, ...],
-    digest: str,
-    fingerprint_class: str,
-    evaluations: Evaluations,
+    record: RunRecord, index: int, cases: tuple[Case, ...], fingerprint_class: str, evaluations: Evaluations
 ) -> Rescored:
     """Plays all cases, in as many attempts as it takes; earlier attempts' outcomes are read, not played again."""
-    whole = record.experiment_dimensions.policy_scope == "submit" and index != RANDOM
-    found: dict[int, EpisodeOutcome] = {}
+    is_whole = record.experiment_dimensions.policy_scope == "submit" and index != RANDOM
+    outcomes: dict[int, EpisodeOutcome] = {}
     for attempt in itertools.count():
-        if len(found) == len(cases):
+        if len(outcomes) == len(cases):
             break
-        if whole:
-            found.clear()
-        missing = tuple(place for place in range(len(cases)) if place not in found)
-        text = f"rescore {record.run} {index} {digest} {attempt}"
+        if is_whole:
+            outcomes.clear()
+        missing = tuple(place for place in range(len(cases)) if place not in outcomes)
+        text = f"rescore {record.run} {index} sha256:{cases_hash(cases)} {attempt}"
         message = Rescore(
-            token="",
             key=hashlib.sha256(text.encode()).hexdigest(),
             run=record.run,
             submit_index=index,
@@ -258,8 +243,8 @@ async def _play(
             fingerprint_class=fingerprint_class,
         )
         async for outcome in evaluations.outcomes(message):
-            found[missing[outcome.index]] = outcome
-    played = [found[place] for place in range(len(cases))]
+            outcomes[missing[outcome.index]] = outcome
+    played = [outcomes[place] for place in range(len(cases))]
     solved = tuple(one.success for one in played)
     return Rescored(
         submit_index=index,

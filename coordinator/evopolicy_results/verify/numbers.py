@@ -44,8 +44,7 @@ def differences(run: RunUnderTest, result: Result | None) -> Iterator[tuple[str,
         yield from _unlike(f"{name}, summary.json", _summary(run, submit, spent))
         yield from _unlike(f"{name}, _meta.json", _meta(run, submit))
         known = stored.get(submit.index)
-        if known is not None:
-            yield from _unlike(f"{name}, summary.json", _stored(submit, known), _STORED)
+        yield from _unlike(f"{name}, summary.json", _stored(submit, known), _STORED)
         if (fault := _checkpoint(submit, known)) is not None:
             yield name, fault
     for played in run.train:
@@ -56,18 +55,17 @@ def differences(run: RunUnderTest, result: Result | None) -> Iterator[tuple[str,
     yield from _unlike("run.json", _outcome(run, spent))
     if result is not None:
         here = [submit.index for submit in run.submits if submit.status != CANCELLED]
-        yield from _unlike("run.json", [("submits", here, sorted(stored))], _STORED)
-        yield from _unlike("run.json", outcome_pairs(run.record.outcome, result), _STORED)
         known_trees = {str(submit.submit_index): submit.tree for submit in result.submits if submit.tree}
-        yield from _unlike("run.json", [("trees", run.record.trees, known_trees)], _STORED)
+        pairs = [("submits", here, sorted(stored)), *outcome_pairs(run.record.outcome, result)]
+        yield from _unlike("run.json", [*pairs, ("trees", run.record.trees, known_trees)], _STORED)
     for index, digest in run.record.trees.items():
         name = trees.name_of(run.root, int(index))
         try:
-            found = trees.read(run.root, name)[1]
+            own = trees.read(run.root, name)[1]
         except ConfigError as error:
             yield "trees", str(error)
         else:
-            yield from _unlike(f"trees/{name}.json", [("digest", found, digest)])
+            yield from _unlike(f"trees/{name}.json", [("digest", own, digest)])
     for name in rescore_names(run.root):
         file = f"{FOLDER}/{name}.json"
         try:
@@ -144,11 +142,8 @@ def _summary(run: RunUnderTest, submit: SubmitFiles, spent: int) -> Told:
     yield "env", summary.env, run.record.env
     if summary.status == CANCELLED:
         return
-    yield (
-        "remaining_budget",
-        summary.remaining_budget,
-        run.record.experiment_dimensions.episode_budget - spent,
-    )
+    budget = run.record.experiment_dimensions.episode_budget
+    yield "remaining_budget", summary.remaining_budget, budget - spent
     if summary.env_instances is not None:
         yield "n_episodes", summary.n_episodes, len(summary.env_instances)
     if summary.status == "ok":
@@ -220,10 +215,10 @@ def _rescore(run: RunUnderTest, name: str, record: RescoreRecord) -> Told:
         yield f"failures {what}", places, [place for place in places if place < record.n_cases]
 
 
-def _stored(submit: SubmitFiles, known: SubmitResult) -> Told:
+def _stored(submit: SubmitFiles, known: SubmitResult | None) -> Told:
     """A submit against the coordinator's result."""
     summary = submit.summary
-    if summary is None or summary.status == CANCELLED:
+    if known is None or summary is None or summary.status == CANCELLED:
         return
     yield "status", summary.status, known.status
     yield "mean_return", summary.mean_return, known.mean_return
@@ -234,20 +229,20 @@ def _stored(submit: SubmitFiles, known: SubmitResult) -> Told:
 def _checkpoint(submit: SubmitFiles, known: SubmitResult | None) -> str | None:
     """Whether the checkpoint's files are those that were submitted; without the coordinator, that its metadata
     names."""
-    named = "" if submit.meta is None else submit.meta.bundle
     submitted = None if known is None else known.bundle
-    wanted = submitted or named
+    wanted = submitted or submit.bundle
     if not wanted:
         return None
     try:
-        digest = bundle_of(submit.checkpoint).digest
+        if bundle_of(submit.checkpoint).digest != wanted:
+            names = "that _meta.json names" if submitted is None else "that was submitted"
+            return f"its checkpoint does not hold the policy {names}"
     except BundleError as error:
         return f"its checkpoint cannot be read: {error}"
-    if digest != wanted:
-        names = "that _meta.json names" if submitted is None else "that was submitted"
-        return f"its checkpoint does not hold the policy {names}"
     return (
-        None if named in ("", wanted) else "_meta.json names another policy than the one that was submitted"
+        "_meta.json names another policy than the one that was submitted"
+        if submit.bundle not in ("", wanted)
+        else None
     )
 
 

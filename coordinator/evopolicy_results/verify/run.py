@@ -36,7 +36,7 @@ from evopolicy_results.verify import numbers
 from evopolicy_results.verify.source import EpisodeList, RunUnderTest
 
 
-class Finding(msgspec.Struct, frozen=True, kw_only=True):
+class Difference(msgspec.Struct, frozen=True, kw_only=True):
     """One episode, or one list of episodes, that differs from the run's record."""
 
     episode: str
@@ -53,23 +53,23 @@ class Report(msgspec.Struct, kw_only=True):
     """Replayed from their recorded actions."""
     from_files: int = 0
     """Of these, episodes whose actions came from feedback files, as the coordinator no longer stores them."""
-    differences: list[Finding] = []
-    not_checked: list[Finding] = []
+    differences: list[Difference] = []
+    not_checked: list[Difference] = []
     unchecked_episodes: int = 0
     """Of these, episodes whose actions nobody has any more."""
     policy_episodes: int = 0
     """Played again by the checkpoint's policy."""
-    policy_differences: list[Finding] = []
+    policy_differences: list[Difference] = []
     """Advisory."""
     fingerprint_differences: list[str] = []
     notes: list[str] = []
 
     def differs(self, episode: str, difference: str) -> None:
         self.identical = False
-        self.differences.append(Finding(episode=episode, difference=difference))
+        self.differences.append(Difference(episode=episode, difference=difference))
 
     def leaves_open(self, episode: str, difference: str) -> None:
-        self.not_checked.append(Finding(episode=episode, difference=difference))
+        self.not_checked.append(Difference(episode=episode, difference=difference))
 
 
 class _Recording(msgspec.Struct, kw_only=True):
@@ -81,7 +81,7 @@ class _Recording(msgspec.Struct, kw_only=True):
     """As stored by the coordinator."""
     stored: bytes | None
     """Its packed trajectory, unpacked only for the comparison: a submit's trajectories together may be gigabytes."""
-    files: bool
+    has_files: bool
     """Whether there are feedback files to compare with."""
 
 
@@ -100,8 +100,8 @@ class Verifier:
             "limits": dimensions.limits,
         }
         self._knows_run = False
-        self._kept: dict[int, _Recording] = {}
-        """Recordings of the list that was replayed last, by index."""
+        self._recorded: dict[int, _Recording] = {}
+        """Of the list that was replayed last, by index."""
         self.report = Report(run_directory=str(run.root), env=run.record.env)
 
     async def check_cases(self) -> bool:
@@ -122,7 +122,7 @@ class Verifier:
                 self.report.leaves_open(f"{split} cases", "run.json has no hash of them: they may be others")
             elif ours != theirs:
                 raise ConfigError(
-                    f"this cluster's {split} cases of {self._run.record.env} are not the run's (SHA-256 {theirs[:12]}…"
+                    f"this cluster's {split} cases of {record.env} are not the run's (SHA-256 {theirs[:12]}…"
                     f" here, {ours[:12]}… in run.json): use the coordinator that made the run, its --state, or its"
                     " --data"
                 )
@@ -148,14 +148,14 @@ class Verifier:
 
     async def replay(self, played: EpisodeList, indexes: Sequence[int]) -> None:
         """Makes the exact check of these episodes of a list."""
-        self._kept = await self._recordings(played, indexes)
-        if not self._kept:
+        self._recorded = recorded = await self._recordings(played, indexes)
+        if not recorded:
             return
         returns: list[float] = []
         async for index, outcome in self._evaluations.replayed(
             played,
-            list(self._kept),
-            actions=[recording.actions for recording in self._kept.values()],
+            list(recorded),
+            actions=[recording.actions for recording in recorded.values()],
             record="full" if played.split == "train" else "actions",
             **self._conditions,
         ):
@@ -165,13 +165,12 @@ class Verifier:
             returns.append(outcome.episode_return)
             self.report.episodes += 1
             replayed = await self._evaluations.recording(outcome)
-            for difference in _differences(played, index, self._kept[index], outcome, replayed):
+            for difference in _differences(played, index, recorded[index], outcome, replayed):
                 self.report.differs(played.name(index), difference)
-        whole = len(returns) == len(played.env_instances)
-        if whole and played.mean is not None and mean(returns) != played.mean:
-            self.report.differs(
-                f"submit {played.submit_index}, {played.split}", f"run.json tells a mean of {played.mean!r}"
-            )
+        is_whole = len(returns) == len(played.env_instances)
+        if is_whole and played.mean is not None and mean(returns) != played.mean:
+            name = f"submit {played.submit_index}, {played.split}"
+            self.report.differs(name, f"run.json tells a mean of {played.mean!r}")
 
     async def play_policy(self, played: EpisodeList, indexes: Sequence[int]) -> None:
         """Makes the advisory check of these train episodes with their checkpoint's policy. Call it right after their
@@ -183,23 +182,24 @@ class Verifier:
                 name, "its one policy plays whole submits, of which this sample is a part"
             )
             return
-        assert played.checkpoint is not None
+        assert played.submit is not None
         try:
-            bundle = bundle_of(played.checkpoint)
+            bundle = bundle_of(played.submit.checkpoint)
         except BundleError as error:
-            if not played.digest:
+            if not played.submit.bundle:
                 self.report.differs(name, f"its checkpoint cannot be read: {error}")
-            return  # otherwise a difference that the check of numbers has found
-        if bundle.digest != played.digest:
-            return  # a difference that the check of numbers has found
+            return  # otherwise a difference that the check of numbers has reported
+        if bundle.digest != played.submit.bundle:
+            return  # a difference that the check of numbers has reported
         async for index, outcome in self._evaluations.replayed(
             played, indexes, bundle=bundle, record="full", **self._conditions
         ):
-            if outcome is None or (recording := self._kept.get(index)) is None:
+            if outcome is None or (recording := self._recorded.get(index)) is None:
                 continue
             self.report.policy_episodes += 1
+            difference: str | None
             if outcome.failure is not None and outcome.trajectory is None:
-                difference: str | None = f"{outcome.failure.category}: {outcome.failure.message}"
+                difference = f"{outcome.failure.category}: {outcome.failure.message}"
             else:
                 again = await self._evaluations.recording(outcome)
                 if recording.stored is not None:
@@ -207,23 +207,20 @@ class Verifier:
                 else:
                     difference = _of_files(played, index, again, actions=True)
             if difference is not None:
-                self.report.policy_differences.append(
-                    Finding(episode=played.name(index), difference=difference)
-                )
+                finding = Difference(episode=played.name(index), difference=difference)
+                self.report.policy_differences.append(finding)
 
     async def check_fingerprint(self) -> None:
         """Compares the library versions of the connected workers with the run's. Call it after workers have played
         episodes."""
-        known = self._run.record.versions.fingerprint
-        found: dict[str, None] = {}
-        for fingerprint in (await self._describe()).fingerprints if known else ():
-            found |= dict.fromkeys(unlike(*comparable([known, fingerprint.flat()])))
-        self.report.fingerprint_differences = list(found)
+        if known := self._run.record.versions.fingerprint:
+            fingerprints = [each.flat() for each in (await self._describe()).fingerprints]
+            differences = [each for here in fingerprints for each in unlike(*comparable([known, here]))]
+            self.report.fingerprint_differences = list(dict.fromkeys(differences))
 
     async def _describe(self) -> EnvironmentState:
         record, dimensions = self._run.record, self._run.record.experiment_dimensions
         message = DescribeEnvironment(
-            token="",
             env=record.env,
             run=record.run,
             n_validation=dimensions.n_validation,
@@ -232,64 +229,63 @@ class Verifier:
         return await self._evaluations.ask.describe(message)
 
     async def _recordings(self, played: EpisodeList, indexes: Sequence[int]) -> dict[int, _Recording]:
-        known = await self._stored(played) if self._knows_run else {}
-        found: dict[int, _Recording] = {}
+        stored: dict[int, EpisodeOutcome] = {}
+        if self._knows_run:
+            run, split, submit = self._run.record.run, played.split, played.submit_index
+            outcomes = self._evaluations.ask.recorded(run, split, submit, timeout_s=TIMEOUT_S)
+            stored = {outcome.index: outcome async for outcome in outcomes}
+        recordings: dict[int, _Recording] = {}
         for index in indexes:
-            name = played.name(index)
-            outcome = known.get(index)
-            rows = self._rows(played, index)
-            stored: bytes | None = None
+            outcome, rows = stored.get(index), self._rows(played, index)
+            trajectory: bytes | None = None
             if outcome is not None and outcome.trajectory is not None:
-                stored = await self._evaluations.ask.fetch(outcome.trajectory)
-                actions = compare.action_log(decode(stored).actions)
+                trajectory = await self._evaluations.ask.fetch(outcome.trajectory)
+                actions = compare.action_log(decode(trajectory).actions)
             elif rows is not None:
                 try:
                     actions = compare.action_log(compare.actions_of(rows))
                 except Exception as error:
                     # JSON of any shape and size: an agent without a jail could have written it.
-                    self.report.differs(
-                        name, f"its actions cannot be played: {type(error).__name__}: {error}"
-                    )
+                    text = f"its actions cannot be played: {type(error).__name__}: {error}"
+                    self.report.differs(played.name(index), text)
                     continue
                 self.report.from_files += 1
             else:
                 if not played.folders:
                     self.report.unchecked_episodes += 1
-                    self.report.leaves_open(name, "the coordinator has no record of it any more")
+                    text = "the coordinator has no record of it any more"
+                    self.report.leaves_open(played.name(index), text)
                 continue
-            found[index] = _Recording(actions=actions, outcome=outcome, stored=stored, files=rows is not None)
-        return found
+            recordings[index] = _Recording(
+                actions=actions, outcome=outcome, stored=trajectory, has_files=rows is not None
+            )
+        return recordings
 
     def _rows(self, played: EpisodeList, index: int) -> compare.Rows | None:
         if not played.folders:
             return None
+        fault = ""
         try:
             rows = compare.Rows(played.folders[index])
+            if not rows and (played.lengths is None or played.lengths[index]):
+                fault = "trajectory.jsonl has no step"
         except (OSError, ValueError) as error:
-            self.report.differs(played.name(index), f"trajectory.jsonl cannot be read: {error}")
-            return None
-        if not rows and (played.lengths is None or played.lengths[index]):
-            self.report.differs(played.name(index), "trajectory.jsonl has no step")
+            fault = f"trajectory.jsonl cannot be read: {error}"
+        if fault:
+            self.report.differs(played.name(index), fault)
             return None
         return rows
-
-    async def _stored(self, played: EpisodeList) -> dict[int, EpisodeOutcome]:
-        """Outcomes that the coordinator stored, by index."""
-        recorded = self._evaluations.ask.recorded(
-            self._run.record.run, played.split, played.submit_index, timeout_s=TIMEOUT_S
-        )
-        return {outcome.index: outcome async for outcome in recorded}
 
 
 def _differences(
     played: EpisodeList, index: int, recording: _Recording, again: EpisodeOutcome, replayed: Trajectory
 ) -> Iterator[str]:
     """All in which an episode that was played again differs from its records."""
-    then, summary = recording.outcome, played.summary
+    then, summary = recording.outcome, played.submit.summary if played.submit else None
     stored = None if recording.stored is None else decode(recording.stored)
     if stored and then and (fault := compare.episode_difference(then, stored, again, replayed)):
         yield f"the stored record: {fault}"
-    if recording.files and (fault := _of_files(played, index, stored or replayed, actions=bool(stored))):
+    if recording.has_files and (fault := _of_files(played, index, stored or replayed, actions=bool(stored))):
         yield f"the feedback files: {fault}"
     if played.returns is not None and not compare.same(played.returns[index], again.episode_return):
         yield f"return {played.returns[index]!r} is told, {again.episode_return!r} came"

@@ -25,34 +25,8 @@ from evopolicy_results.evaluations import RANDOM, Cases
 _MAX_DIGITS = 9
 
 
-class EpisodeList(Cases, frozen=True, kw_only=True):
-    """A list of cases that one policy played, and what the run directory has of its episodes."""
-
-    returns: tuple[float, ...] | None
-    """None when the directory records only `mean`."""
-    lengths: tuple[int, ...] | None = None
-    summary: Summary | None = None
-    """Of a submit's train episodes."""
-    mean: float | None = None
-    folders: tuple[Path, ...] = ()
-    """Each train episode's folder; empty for hidden ones, and where the agent was shown scores alone."""
-    pictures: bool = True
-    """Whether the folders have the observations that are stored outside the rows."""
-    checkpoint: Path | None = None
-    """`checkpoints/submit_NNN` of the policy; None for the random reference."""
-    digest: str = ""
-    """Digest of the policy's bundle, from the checkpoint's metadata."""
-
-    def name(self, index: int) -> str:
-        """An episode's name in reports."""
-        if self.folders:
-            return f"submit {self.submit_index}, {self.folders[index].name}"
-        policy = "random actions" if self.submit_index == RANDOM else f"submit {self.submit_index}"
-        return f"{policy}, {self.split} episode {index}"
-
-
 class SubmitFiles(msgspec.Struct, frozen=True, kw_only=True):
-    """What the directory has of one submit."""
+    """A submit's files in the directory."""
 
     index: int
     """By the name of its folders."""
@@ -70,11 +44,38 @@ class SubmitFiles(msgspec.Struct, frozen=True, kw_only=True):
         return "" if self.meta is None else self.meta.validation_status
 
     @property
+    def bundle(self) -> str:
+        """Digest of its bundle, from the metadata; empty where they have none."""
+        return "" if self.meta is None else self.meta.bundle
+
+    @property
     def n_episodes(self) -> int:
         """Episodes charged."""
         if self.summary is not None:
             return self.summary.n_episodes
         return 0 if self.meta is None else self.meta.n_episodes_requested
+
+
+class EpisodeList(Cases, frozen=True, kw_only=True):
+    """A list of cases that one policy played, with the run directory's files and numbers of its episodes."""
+
+    returns: tuple[float, ...] | None = None
+    """None when the directory records only `mean`."""
+    lengths: tuple[int, ...] | None = None
+    submit: SubmitFiles | None = None
+    """Of train episodes."""
+    mean: float | None = None
+    folders: tuple[Path, ...] = ()
+    """Each train episode's folder; empty for hidden ones, and where the agent was shown scores alone."""
+    pictures: bool = True
+    """Whether the folders have the observations that are stored outside the rows."""
+
+    def name(self, index: int) -> str:
+        """An episode's name in reports."""
+        if self.folders:
+            return f"submit {self.submit_index}, {self.folders[index].name}"
+        policy = "random actions" if self.submit_index == RANDOM else f"submit {self.submit_index}"
+        return f"{policy}, {self.split} episode {index}"
 
 
 class RunUnderTest(msgspec.Struct, frozen=True, kw_only=True):
@@ -104,7 +105,7 @@ def read_run(root: Path) -> RunUnderTest:
         raise ConfigError(f"{root / RUN_JSON}: {error}") from error
     feedback, checkpoints = root / "workspace" / "feedback", root / "checkpoints"
     folders = {**submit_folders(checkpoints), **submit_folders(feedback)}
-    found = [
+    submits = [
         SubmitFiles(
             index=index,
             summary=_summary(feedback / folder.name),
@@ -114,15 +115,15 @@ def read_run(root: Path) -> RunUnderTest:
         )
         for index, folder in sorted(folders.items())
     ]
-    submits = tuple(submit for submit in found if submit.status not in REJECTED)
+    submits = [submit for submit in submits if submit.status not in REJECTED]
     train = tuple(played for submit in submits if (played := _train(record, submit)))
     hidden = tuple(_hidden(record, {one.submit_index: one for one in train}))
-    return RunUnderTest(root=root, record=record, submits=submits, train=train, hidden=hidden)
+    return RunUnderTest(root=root, record=record, submits=tuple(submits), train=train, hidden=hidden)
 
 
 def _train(record: RunRecord, submit: SubmitFiles) -> EpisodeList | None:
     """The episodes of an `ok` submit; None for any other."""
-    summary, folder, meta = submit.summary, submit.feedback, submit.meta
+    summary, folder = submit.summary, submit.feedback
     if summary is None or summary.env_instances is None or summary.first_global_episode is None:
         return None
     width = max(3, len(str(record.experiment_dimensions.episode_budget)))
@@ -136,14 +137,12 @@ def _train(record: RunRecord, submit: SubmitFiles) -> EpisodeList | None:
         # Other numbers of them are a difference by themselves.
         returns=summary.returns if len(summary.returns or ()) == n else None,
         lengths=summary.episode_lengths if len(summary.episode_lengths or ()) == n else None,
-        summary=summary,
+        submit=submit,
         # At the level `scores` the feedback has no trajectories.
         folders=()
         if record.experiment_dimensions.feedback == "scores"
         else tuple(folder / "episodes" / f"ep_{first + index:0{width}d}" for index in range(n)),
         pictures=record.experiment_dimensions.feedback == "pictures",
-        checkpoint=submit.checkpoint,
-        digest="" if meta is None else meta.bundle,
     )
 
 
@@ -164,21 +163,12 @@ def _hidden(record: RunRecord, train: dict[int, EpisodeList]) -> Iterator[Episod
             env_instances=(),
             modulo=n,
             remaining_budget_after=0,
-            returns=None,
         )
         rows.append(("heldout", own, n, reference.returns, reference.mean_return))
     for split, of, n, told, mean in rows:
         if of is not None:
-            yield msgspec.structs.replace(
-                of,
-                split=split,
-                env_instances=tuple(range(n)),
-                returns=told,
-                lengths=None,
-                summary=None,
-                mean=mean,
-                folders=(),
-            )
+            hidden = {"split": split, "env_instances": tuple(range(n)), "returns": told, "mean": mean}
+            yield msgspec.structs.replace(of, **hidden, lengths=None, submit=None, folders=())
 
 
 def _summary(folder: Path) -> Summary | None:

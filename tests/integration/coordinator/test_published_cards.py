@@ -25,13 +25,13 @@ import json, socket, sys
 def refuse(*_): raise OSError("no network")
 socket.socket.connect = socket.getaddrinfo = refuse
 import mlcroissant
-found = mlcroissant.Dataset(sys.argv[1])
-issues = found.metadata.ctx.issues
+dataset = mlcroissant.Dataset(sys.argv[1])
+issues = dataset.metadata.ctx.issues
 records = [
     {name: value.decode() if isinstance(value, bytes) else value for name, value in each.items()}
-    for each in found.records("runs")
+    for each in dataset.records("runs")
 ]
-limits = found.metadata.data_limitations
+limits = dataset.metadata.data_limitations
 print(json.dumps([sorted(issues.errors), sorted(issues.warnings), records, limits], default=float))
 """
 
@@ -46,8 +46,8 @@ def checked(results: Results, forger: Forger) -> Checked:
     return rules.check(Held(forger.files), results.summary["signer"])
 
 
-def states(found: Checked, kind: str = "card") -> list[str]:
-    return [each.state for each in found.findings if each.kind == kind]
+def states(result: Checked, kind: str = "card") -> list[str]:
+    return [each.state for each in result.findings if each.kind == kind]
 
 
 def validated(
@@ -105,17 +105,17 @@ def test_a_changed_card_is_refused_and_a_narrower_interval_too(results: Results)
 def test_a_card_of_another_version_is_a_claim(results: Results) -> None:
     forger = Forger(results.files)
     forger.json(contents.CARD, lambda card: card.update(version=cards.VERSION + 1))
-    found = checked(results, forger)
-    assert not found.failed
-    assert states(found) == ["open"]
-    assert found.claims[contents.CARD_TEXT] == ["**"]
+    result = checked(results, forger)
+    assert not result.failed
+    assert states(result) == ["open"]
+    assert result.claims[contents.CARD_TEXT] == ["**"]
 
 
 def test_licences_of_other_versions_are_claims(results: Results) -> None:
     forger = described(results, msgspec.structs.replace(card_of(results), licences=licences(["atari"])))
-    found = checked(results, forger)
-    assert states(found) == ["ok"]
-    assert "licences.*.licence" in found.claims[contents.CARD]
+    result = checked(results, forger)
+    assert states(result) == ["ok"]
+    assert "licences.*.licence" in result.claims[contents.CARD]
     assert b"| game ROMs |  | unknown | atari |" in forger.files[contents.CARD_TEXT]
 
 

@@ -55,11 +55,11 @@ def checked(results: Results, forger: Forger) -> Checked:
     return rules.check(Held(forger.files), results.summary["signer"], heads=[head])
 
 
-def claimed(found: Checked, file: str, path: tuple[str, ...]) -> bool:
+def claimed(outcome: Checked, file: str, path: tuple[str, ...]) -> bool:
     """Whether the output lists the field as a claim."""
     kind = (fields.file_kind(file) or "").removeprefix("runs/*/")
     begin = f"nobody can check, in {kind}: "
-    texts = [each.text.removeprefix(begin) for each in found.findings if each.text.startswith(begin)]
+    texts = [each.text.removeprefix(begin) for each in outcome.findings if each.text.startswith(begin)]
     listed = [field for text in texts for field in text.split(", ")]
     # `a.*.b` for any element, `a.**` for everything below.
     return any(
@@ -99,9 +99,9 @@ def test_each_changed_field_is_refused_contradicted_or_listed_as_a_claim(results
             continue  # hundreds of cases that are alike
         forger = Forger(results.files)
         forger.put(file, with_leaf(content, path))
-        found = signed(results, forger, file)
+        outcome = signed(results, forger, file)
         n += 1
-        if not found.failed and not claimed(found, file, path):
+        if not outcome.failed and not claimed(outcome, file, path):
             through.append(".".join(path))
     assert n > 1
     assert through == []
@@ -172,9 +172,9 @@ def test_changed_actions_are_listed_as_what_replay_alone_compares(results: Resul
     forger = Forger(results.files)
     forger.rerecord("heldout-001", lambda row: (row.action + 1, row.reward))
     forger.sign(results.root / "st")
-    found = checked(results, forger)
-    assert not found.failed
-    assert any(each.kind == "claims" and "only --replay" in each.text for each in found.findings)
+    outcome = checked(results, forger)
+    assert not outcome.failed
+    assert any(each.kind == "claims" and "only --replay" in each.text for each in outcome.findings)
 
 
 def test_files_of_no_kind_are_refused(results: Results) -> None:
@@ -242,10 +242,10 @@ def older(results: Results) -> Forger:
 
 def test_results_of_earlier_versions_hold_and_list_more_claims(results: Results) -> None:
     forger = older(results)
-    found = rules.check(Held(forger.files), results.summary["signer"])
-    assert [each for each in found.findings if each.state == "failed"] == []
+    outcome = rules.check(Held(forger.files), results.summary["signer"])
+    assert [each for each in outcome.findings if each.state == "failed"] == []
     for field in ("versions.fingerprint.cpu", "agent.model_string", "hidden_isolation", "jail"):
-        assert claimed(found, "runs/0000/run.json", tuple(field.split("."))), field
+        assert claimed(outcome, "runs/0000/run.json", tuple(field.split("."))), field
     now = rules.check(Held(results.files), results.summary["signer"])
     assert not claimed(now, "runs/0000/run.json", ("versions", "fingerprint", "cpu"))
 

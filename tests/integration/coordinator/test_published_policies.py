@@ -39,8 +39,8 @@ submit_policy(text + "#", [2, 3])
 def findings(cwd: Path, *options: str, kind: str = "policies") -> tuple[int, list[dict[str, Any]]]:
     done = evopolicy(cwd, "check", "results.evp", "--json", *options)
     assert done.stdout, done.stderr
-    found = [each for each in json.loads(done.stdout)["findings"] if each["kind"] == kind]
-    return done.returncode, found
+    played = [each for each in json.loads(done.stdout)["findings"] if each["kind"] == kind]
+    return done.returncode, played
 
 
 @pytest.mark.timeout(900)
@@ -59,12 +59,12 @@ def test_deterministic_policies_give_the_recorded_actions_and_a_false_declaratio
         for path in tmp_path.glob("runs/*/*/*/run.json")
     }
 
-    code, found = findings(tmp_path)
-    assert (code, {each["state"] for each in found}) == (0, {"open"})
-    code, found = findings(tmp_path, "--policies", "all")
+    code, played = findings(tmp_path)
+    assert (code, {each["state"] for each in played}) == (0, {"open"})
+    code, played = findings(tmp_path, "--policies", "all")
     assert code == 1
     by_entry: dict[str, list[dict[str, Any]]] = {}
-    for each in found:
+    for each in played:
         by_entry.setdefault(runs[each["run"]], []).append(each)
     # 5 train episodes, 3 validation cases of both checkpoints, 4 held-out ones.
     (honest,) = by_entry["honest"]
@@ -81,7 +81,7 @@ def test_deterministic_policies_give_the_recorded_actions_and_a_false_declaratio
 def test_an_environment_that_does_not_repeat_episodes_is_not_played(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Of a package whose definition says so. What the published file says about it counts for nothing."""
+    """The installed package defines it so; the published file's own statement does not count."""
     package = tmp_path / "plugin" / "acme_moody"
     package.mkdir(parents=True)
     (package / "__init__.py").write_text(
@@ -99,7 +99,7 @@ def test_an_environment_that_does_not_repeat_episodes_is_not_played(
     numbers = words("--env acme/moody --budget 5 --validation 1 --heldout 1 --state st")
     evopolicy(tmp_path, "local", *numbers, *own, code=0)
     evopolicy(tmp_path, *words("publish runs --out results.evp --local --state st"), code=0)
-    for option, kind, left in (("--replay", "replay", 3), ("--policies", "policies", 0)):
-        code, found = findings(tmp_path, option, "all", kind=kind)
-        assert (code, [each["state"] for each in found]) == (left, ["open"]), found
-        assert "acme/moody is marked as not deterministic" in found[0]["text"]
+    for option, kind, wanted in (("--replay", "replay", 3), ("--policies", "policies", 0)):
+        code, played = findings(tmp_path, option, "all", kind=kind)
+        assert (code, [each["state"] for each in played]) == (wanted, ["open"]), played
+        assert "acme/moody is marked as not deterministic" in played[0]["text"]

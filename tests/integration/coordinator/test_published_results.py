@@ -14,7 +14,6 @@ import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import msgspec
 import pytest
@@ -149,7 +148,7 @@ NOT_SIGNED_ANEW: dict[str, tuple[Edit, str, str]] = {
     "a file added": (lambda f: f.files.__setitem__("runs/0000/notes", b"x"), "digests", "was added"),
     "a dropped file": (lambda f: f.files.pop("runs/0000/checkpoints/000") and None, "digests", "is missing"),
     "an edited manifest": (lambda f: f.text(contents.MANIFEST, b'"software":"', b'"software":"9'), "signature", "not a signature"),
-    "a manifest with a field twice": (lambda f: f.text(contents.MANIFEST, b"{", b'{"version":1,'), "format", "added or doubled"),
+    "a manifest with a field twice": (lambda f: f.text(contents.MANIFEST, b"{", b'{"version":1,'), "format", "a key occurs twice"),
     "a signature that is none": (lambda f: f.json(contents.SIGNATURE, put("signature", value="zz")), "signature", "not a signature"),
     "no signature": (lambda f: f.files.pop(contents.SIGNATURE) and None, "format", "signature.json is missing"),
     "a later format": (lambda f: f.json(contents.MANIFEST, put("version", value=2)), "format", "reads 'evopolicy results' version 1"),
@@ -158,7 +157,7 @@ NOT_SIGNED_ANEW: dict[str, tuple[Edit, str, str]] = {
 }  # fmt: skip
 
 
-def found(files: dict[str, bytes], identity: str = "") -> list[Finding]:
+def failures(files: dict[str, bytes], identity: str = "") -> list[Finding]:
     return [each for each in rules.check(Held(files), identity).findings if each.state == "failed"]
 
 
@@ -180,9 +179,9 @@ def test_tampering_is_named_though_all_is_signed_anew(results: Results, kind: st
     forger = Forger(results.files)
     edit(forger)
     forger.sign()
-    findings = found(forger.files)
+    findings = failures(forger.files)
     assert named(findings, finding, text), findings
-    assert named(found(forger.files, results.summary["signer"]), "identity", "another signer")
+    assert named(failures(forger.files, results.summary["signer"]), "identity", "another signer")
 
 
 @pytest.mark.parametrize("kind", NOT_SIGNED_ANEW)
@@ -190,14 +189,14 @@ def test_tampering_with_what_was_signed_is_named(results: Results, kind: str) ->
     edit, finding, text = NOT_SIGNED_ANEW[kind]
     forger = Forger(results.files)
     edit(forger)
-    assert named(found(forger.files), finding, text), found(forger.files)
+    assert named(failures(forger.files), finding, text), failures(forger.files)
 
 
 def test_signing_anew_alone_is_another_signer(results: Results) -> None:
     forger = Forger(results.files)
     forger.sign()
-    assert found(forger.files) == []
-    assert [each.kind for each in found(forger.files, results.summary["signer"])] == ["identity"]
+    assert failures(forger.files) == []
+    assert [each.kind for each in failures(forger.files, results.summary["signer"])] == ["identity"]
 
 
 def test_selected_runs_show_what_they_were_selected_from(results: Results) -> None:
@@ -287,21 +286,9 @@ def test_the_command_checks_and_replays(results: Results) -> None:
     assert (plain.returncode, document["ok"], document["signer"]) == (0, True, identity)
 
 
-def raised(change: Callable[[list[float]], list[float]]) -> Callable[[dict[str, Any]], None]:
-    """Other held-out returns in a result."""
-
-    def new(result: dict[str, Any]) -> None:
-        result["heldout_returns"] = change(result["heldout_returns"])
-        result["final_score"] = math.fsum(result["heldout_returns"]) / len(result["heldout_returns"])
-
-    return new
-
-
 def invented(results: Results) -> str:
-    """A file with held-out returns that nobody got, without recordings that would tell; its journal agrees."""
     forger = Forger(results.files)
-    forger.begin_anew(raised(lambda old: [each + 100.0 for each in old]))
-    del forger.files["runs/0000/actions/heldout-001"]
+    forger.invent_returns()
     forger.place()
     forger.sign(results.root / "st")
     forger.write(results.root / "invented.evp")
@@ -341,7 +328,7 @@ def test_an_edited_processor_excuses_differences_of_last_places_alone(results: R
         forger.rerecord("heldout-001", lambda row, change=change: (row.action, change(row.reward)))
         value = forger.returns("heldout-001")[0]
         forger.begin_anew(lambda result: result.pop("record") and None)
-        forger.begin_anew(raised(lambda old, value=value: [value, *old[1:]]))  # type: ignore[misc]
+        forger.raise_returns(lambda old, value=value: [value, *old[1:]])  # type: ignore[misc]
         forger.json(RUN, put("versions", "fingerprint", "cpu", value="another"))
         forger.place()
         forger.sign()
@@ -388,7 +375,7 @@ def test_a_hundred_thousand_entries_are_checked_in_seconds(results: Results) -> 
     forger.entries(lambda lines: [*lines, *more])
     forger.sign()
     began = time.process_time()
-    assert found(forger.files) == []
+    assert failures(forger.files) == []
     assert time.process_time() - began < 60
 
 

@@ -233,7 +233,7 @@ def test_runs_that_cannot_be_rescored_are_refused_with_the_reason(played: Played
     unfinished = tmp_path / "unfinished"
     shutil.copytree(run, unfinished)
     (unfinished / "run.json").unlink()
-    assert "the run is not finished" in refused(str(unfinished), "--cases", "2")
+    assert "the run did not finish" in refused(str(unfinished), "--cases", "2")
 
     def changed(name: str, change: dict[str, Any]) -> str:
         copy = tmp_path / name
@@ -270,7 +270,7 @@ def test_runs_that_the_coordinator_does_not_know_leave_the_others_rescored(
         f"not re-scored: {tmp_path / 'a-strange'}: this cluster's coordinator has no finished run r-other"
         in said
     )
-    assert f"not re-scored: {tmp_path / 'unfinished'} has no run.json" in said
+    assert f"not re-scored: {tmp_path / 'unfinished'}: the run did not finish: it has no run.json" in said
     assert "1 of 3 runs are re-scored" in said
 
 

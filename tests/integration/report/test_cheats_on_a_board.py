@@ -15,7 +15,6 @@ from commands import agent, evopolicy, words
 from publications import AGENT, ENV, Forger, read
 
 from evopolicy_common.records import journal
-from evopolicy_common.records.aggregates import mean
 from evopolicy_common.records.code_metrics import TREND, code_metrics
 from evopolicy_common.records.policies import bundles
 from evopolicy_common.records.policies.bundles import BundleFile
@@ -29,24 +28,10 @@ from evopolicy_results.publish.replay import replay
 pytestmark = [pytest.mark.system, pytest.mark.timeout(900)]
 PAGE = Path(__file__).parents[3] / "docs/how-to/publish.md"
 RUN, RESULT = f"runs/0000/{contents.RUN}", f"runs/0000/{contents.RESULT}"
-HELDOUT = "runs/0000/actions/heldout-001"
 RUNS = {
     "lab-a": [("a1", "one"), ("a2", "one"), ("a3", "one")],
     "lab-b": [("b1", "one"), ("b2", "one"), ("b2", "two"), ("b3", "one"), ("b3-again", "one")],
 }
-
-
-def raised(forger: Forger, change: Callable[[list[float]], list[float]]) -> None:
-    def new(result: dict[str, Any]) -> None:
-        result["heldout_returns"] = change(result["heldout_returns"])
-        result["final_score"] = mean(result["heldout_returns"])
-
-    forger.begin_anew(new)
-
-
-def invented(forger: Forger) -> None:
-    raised(forger, lambda old: [each + 100.0 for each in old])
-    del forger.files[HELDOUT]
 
 
 def another_processor(forger: Forger) -> None:
@@ -58,7 +43,7 @@ def another_processor(forger: Forger) -> None:
 
 def raised_rewards(forger: Forger) -> None:
     forger.rerecord("heldout-001", lambda row: (row.action, row.reward + 1.0), n=3)
-    raised(forger, lambda old: forger.returns("heldout-001"))
+    forger.raise_returns(lambda old: forger.returns("heldout-001"))
 
     def told(result: dict[str, Any]) -> None:
         result["record"]["versions.fingerprint"]["cpu"] = "x86_64 SSE2"
@@ -78,7 +63,7 @@ def doubled_key(forger: Forger) -> None:
 
 def raised_score(forger: Forger) -> None:
     lines = forger.files[contents.JOURNAL]
-    raised(forger, lambda old: [each + 1.0 for each in old])
+    forger.raise_returns(lambda old: [each + 1.0 for each in old])
     forger.files[contents.JOURNAL] = lines
 
 
@@ -110,14 +95,14 @@ def from_elsewhere(forger: Forger) -> None:
 
 
 def nothing(forger: Forger) -> None:
-    """What is wrong was done before the publication."""
+    """The cheat was done before the publication."""
 
 
 Cheat = tuple[str, Callable[[Forger], None]]
 BOARDS: tuple[dict[str, Cheat], ...] = (
     {
         "a1": ("none", nothing),
-        "a2": ("held-out returns raised from the start, their recordings removed", invented),
+        "a2": ("held-out returns raised from the start, their recordings removed", Forger.invent_returns),
         "a3": ("name of the agent's model in `run.json` changed after the end", another_model),
         "b1": ("agent's working time changed", working_time),
         "b2": ("worse run left out, journal begun anew", begun_anew),
@@ -229,8 +214,8 @@ def test_a_check_ends_with_the_code_of_the_page(labs: Labs, number: int) -> None
 def test_a_journal_that_was_begun_anew_lacks_the_noted_head(labs: Labs) -> None:
     for number, failed in ((0, True), (1, False)):
         with Archive(labs.root / f"b2-{number}.evp") as archive:
-            found = rules.check(archive, heads=[labs.heads["b2"]])
-        assert any(each.kind == "order" and each.state == "failed" for each in found.findings) == failed
+            checked = rules.check(archive, heads=[labs.heads["b2"]])
+        assert any(each.kind == "order" and each.state == "failed" for each in checked.findings) == failed
 
 
 def test_the_table_of_the_page_has_the_cheats_of_the_boards() -> None:

@@ -1,5 +1,5 @@
 """Recordings of held-out episodes: one sweep on a real cluster plays the same policy unrecorded, recorded, and with
-videos in its feedback; the report of it is looked at in a real headless Chromium."""
+videos in its feedback; a real headless Chromium shows its report."""
 
 from __future__ import annotations
 

@@ -37,28 +37,28 @@ def bundle(root: Path, signer: str, lab: str, *entries: str) -> LabBundle:
     return LabBundle(file="x.evp", sha256="", lab=lab, checked=Checked(signer=signer), runs=runs)
 
 
-def entries(found: LabBundle) -> list[str]:
-    return [each.run.entry for each in found.runs]
+def entries(of: LabBundle) -> list[str]:
+    return [each.run.entry for each in of.runs]
 
 
 def test_entries_of_several_signers_get_their_names(tmp_path: Path) -> None:
-    found = [bundle(tmp_path, A, "Lab-A", "evolve", "own"), bundle(tmp_path, B, "Lab-B", "evolve")]
-    _tell_apart(found)
-    assert [entries(each) for each in found] == [["evolve (Lab-A)", "own"], ["evolve (Lab-B)"]]
+    bundles = [bundle(tmp_path, A, "Lab-A", "evolve", "own"), bundle(tmp_path, B, "Lab-B", "evolve")]
+    _tell_apart(bundles)
+    assert [entries(each) for each in bundles] == [["evolve (Lab-A)", "own"], ["evolve (Lab-B)"]]
 
 
 def test_files_of_one_signer_whose_journals_contradict_each_other_are_reported(tmp_path: Path) -> None:
-    found = [bundle(tmp_path / str(n), signer, "", "evolve") for n, signer in enumerate((A, A, A, A, B))]
+    bundles = [bundle(tmp_path / str(n), signer, "", "evolve") for n, signer in enumerate((A, A, A, A, B))]
     lines = [b"first", b"second", b"third"]
     anew = [b"first", b"third"]
-    for each, entered in zip(found, (lines[:2], lines, anew, [], anew), strict=True):
+    for each, entered in zip(bundles, (lines[:2], lines, anew, [], anew), strict=True):
         each.file, each.heads = f"{len(entered)}.evp", journal.heads(entered)
-    _compare_journals(found)
-    told = [[each.text for each in one.checked.findings if each.state == "failed"] for one in found]
+    _compare_journals(bundles)
+    told = [[each.text for each in one.checked.findings if each.state == "failed"] for one in bundles]
     assert [len(each) for each in told] == [0, 1, 1, 0, 0]
     assert "the first 2 entries are others in 3.evp of the same signer" in told[2][0]
-    assert found[2].checked.state_of("order") == "failed"
-    assert not any(each.refused for each in found)
+    assert bundles[2].checked.state_of("order") == "failed"
+    assert not any(each.refused for each in bundles)
 
 
 def test_no_signer_gets_into_the_entry_of_another(tmp_path: Path) -> None:
@@ -70,17 +70,17 @@ def test_no_signer_gets_into_the_entry_of_another(tmp_path: Path) -> None:
         ]
     ):
         root = tmp_path / str(n)
-        found = [bundle(root, A, lab_a, "evolve"), bundle(root, B, lab_b, *theirs)]
-        _tell_apart(found)
-        ours, others = map(entries, found)
+        bundles = [bundle(root, A, lab_a, "evolve"), bundle(root, B, lab_b, *theirs)]
+        _tell_apart(bundles)
+        ours, others = map(entries, bundles)
         assert not set(ours) & set(others)
         assert len(set(others)) == len(theirs)
 
 
 def test_runs_of_one_name_in_two_files_have_own_pages(tmp_path: Path) -> None:
-    found = [bundle(tmp_path / name, A, "Lab-A", "evolve") for name in ("first", "second", "third")]
-    _tell_apart(found)
-    names = [bundle.runs[0].run.name for bundle in found]
+    bundles = [bundle(tmp_path / name, A, "Lab-A", "evolve") for name in ("first", "second", "third")]
+    _tell_apart(bundles)
+    names = [bundle.runs[0].run.name for bundle in bundles]
     assert len(set(names)) == 3
     assert [name.rpartition(" (")[2] for name in names[1:]] == ["second-0)", "third-0)"]
 
@@ -120,6 +120,6 @@ def test_an_earlier_site_stays_until_the_new_one_is_whole(
 
 def test_a_page_that_is_no_leaderboard_is_not_replaced(tmp_path: Path) -> None:
     (tmp_path / "index.html").write_text("mine")
-    with pytest.raises(ConfigError, match=r"no index\.html of a leaderboard"):
+    with pytest.raises(ConfigError, match="holds other files"):
         write.write_site([], tmp_path, title="Board")
     assert (tmp_path / "index.html").read_text() == "mine"

@@ -1,4 +1,4 @@
-"""What must not be published is found wherever it stands, and what tells nobody apart is not."""
+"""Terms of the publishing machine are matched wherever they stand; names that identify nobody are not."""
 
 from __future__ import annotations
 
@@ -36,23 +36,23 @@ def needles() -> tuple[scrub.Needle, ...]:
         ("/home/jean/policy.py", "a home folder"),
     ],
 )
-def test_what_tells_of_a_machine_is_found(text: str, what: str) -> None:
+def test_terms_of_a_machine_are_matched(text: str, what: str) -> None:
     data = b"\x93\x00" + text.encode() + b"\xff"
-    assert any(what in found for found in scrub.search(data, needles()))
+    assert any(what in kind for kind in scrub.search(data, needles()))
 
 
 @pytest.mark.parametrize(
     "text",
     ["summaries of rootless trees", "#!/usr/bin/env python3", "yes, en_US.UTF-8", "roots = np.roots(x)"],
 )
-def test_what_tells_nobody_apart_is_no_find(text: str) -> None:
+def test_names_that_identify_nobody_are_not_matched(text: str) -> None:
     assert scrub.search(text.encode(), needles()) == []
 
 
-def test_a_find_does_not_repeat_what_it_found() -> None:
-    found = scrub.search(b"marie tok3n-of-the-operator k-0123456789", needles())
-    assert len(found) == 3
-    assert not any("marie" in text or "tok3n" in text or "k-01" in text for text in found)
+def test_a_match_is_named_without_its_text() -> None:
+    kinds = scrub.search(b"marie tok3n-of-the-operator k-0123456789", needles())
+    assert len(kinds) == 3
+    assert not any("marie" in text or "tok3n" in text or "k-01" in text for text in kinds)
 
 
 def test_a_log_keeps_everything_but_what_the_search_finds() -> None:

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from evopolicy_results.cli.cluster import where_of
+from evopolicy_results.cli.cluster import Where
 
 
 def _sweep(folder: Path, name: str) -> Path:
@@ -26,7 +26,7 @@ def test_a_sweep_with_its_own_cluster_is_named_with_the_option(
     sweep = _sweep(tmp_path, "sweep")
     (sweep / "agent/gym_acrobot/0").mkdir(parents=True)
     with pytest.raises(SystemExit):
-        where_of(None, None, True, None, runs=[sweep / given])
+        Where(None, None, True, None, runs=[sweep / given])
     assert f"add --state {sweep}/.cluster\n" in capsys.readouterr().err
 
 
@@ -36,20 +36,20 @@ def test_named_states_and_running_clusters_are_taken_as_they_are(
     sweep = _sweep(tmp_path, "sweep")
     alone = tmp_path / "runs" / "evolve"
     alone.mkdir(parents=True)
-    assert where_of(None, None, True, None, runs=[alone]).state is None
-    assert where_of(None, None, True, sweep / ".cluster", runs=[sweep]).state == sweep / ".cluster"
-    assert not where_of(["tls/host:7447"], None, False, None, runs=[sweep]).local
+    assert Where(None, None, True, None, runs=[alone]).state is None
+    assert Where(None, None, True, sweep / ".cluster", runs=[sweep]).state == sweep / ".cluster"
+    assert not Where(["tls/host:7447"], None, False, None, runs=[sweep]).local
 
 
 def test_another_users_folder_beside_the_runs_does_not_end_the_command() -> None:
     program = """
 import os, sys
 from pathlib import Path
-from evopolicy_results.cli.cluster import where_of
+from evopolicy_results.cli.cluster import Where
 
 if os.getuid() == 0:
     os.setuid(65534)
-where_of(None, None, True, None, runs=[Path(sys.argv[1])])
+Where(None, None, True, None, runs=[Path(sys.argv[1])])
 """
     with tempfile.TemporaryDirectory() as folder:
         Path(folder).chmod(0o755)

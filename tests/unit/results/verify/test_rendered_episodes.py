@@ -48,7 +48,7 @@ def test_a_rendered_episode_and_its_replay_are_the_same(kind: str) -> None:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_what_differs_in_a_replay_is_reported(kind: str) -> None:
+def test_each_difference_of_a_replay_is_reported(kind: str) -> None:
     obs, storage = KINDS[kind]
     recorded = episode(Renderer("arrays", storage), obs)
     other = {**obs, "n": 4} if isinstance(obs, dict) else obs + obs.dtype.type(1)

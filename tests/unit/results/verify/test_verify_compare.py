@@ -1,4 +1,4 @@
-"""What `evopolicy verify` takes for the same: bits of trajectories, and what feedback files say of them."""
+"""Comparisons of `evopolicy verify`: bits of trajectories, and feedback files against them."""
 
 from __future__ import annotations
 
@@ -135,8 +135,8 @@ def test_a_tampered_field_of_a_file_is_found(tmp_path: Path, field: str) -> None
         field
     ]
     write_files(tmp_path / "ep", rows)
-    found = files_difference(tmp_path / "ep", Rows(tmp_path / "ep"), episode(), actions=True)
-    assert found.startswith(f"step 1: {field}")
+    difference = files_difference(tmp_path / "ep", Rows(tmp_path / "ep"), episode(), actions=True)
+    assert difference.startswith(f"step 1: {field}")
 
 
 def test_a_row_that_was_taken_out_is_found(tmp_path: Path) -> None:

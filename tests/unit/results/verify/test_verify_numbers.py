@@ -181,7 +181,7 @@ ALONE: dict[str, tuple[Edit, str]] = {
     "an episode of another run": (lambda run: (run.root / LAST).parent.joinpath("episodes", "ep_009").mkdir(parents=True), "ep_009 is none of its episodes"),
     "a submit dropped": (lambda run: [shutil.rmtree((run.root / name).parent) for name in (FIRST, "checkpoints/submit_000/x")], "files of a submit are missing"),
 }  # fmt: skip
-"""Edits that the directory itself contradicts, with a part of what is found."""
+"""Edits that the directory itself contradicts, with a part of the difference."""
 CONSISTENT: dict[str, tuple[Edit, str]] = {
     "raised held-out returns": (lambda run: _score(run, [-1.0] * 32), "final_score is -1.0; the coordinator has"),
     "the last submit dropped": (_drop_last_submit, "submits is [0, 1]; the coordinator has [0, 1, 2]"),
@@ -195,21 +195,21 @@ CONSISTENT: dict[str, tuple[Edit, str]] = {
 """Edits that only the coordinator's result contradicts."""
 
 
-def _found(run: Path, result: Result | None) -> list[str]:
+def _texts(run: Path, result: Result | None) -> list[str]:
     return [f"{name}: {text}" for name, text in differences(read_run(run), result)]
 
 
 def test_an_untouched_run_has_no_differences(whole: Path, result: Result) -> None:
-    assert _found(whole, None) == []
-    assert _found(whole, result) == []
+    assert _texts(whole, None) == []
+    assert _texts(whole, result) == []
 
 
 @pytest.mark.parametrize("kind", ALONE)
 def test_an_edit_is_found_by_the_other_numbers(whole: Path, tmp_path: Path, kind: str) -> None:
     edit, text = ALONE[kind]
     edit(Copy(Path(shutil.copytree(whole, tmp_path / "run"))))
-    found = _found(tmp_path / "run", None)
-    assert any(text in each for each in found), found
+    texts = _texts(tmp_path / "run", None)
+    assert any(text in each for each in texts), texts
 
 
 @pytest.mark.parametrize("kind", CONSISTENT)
@@ -220,9 +220,9 @@ def test_a_consistent_edit_is_found_by_the_coordinators_result(
     if kind == "no random reference":
         result = msgspec.structs.replace(result, random_heldout_returns=(-500.0,))
     edit(Copy(Path(shutil.copytree(whole, tmp_path / "run"))))
-    assert _found(tmp_path / "run", None) == []
-    found = _found(tmp_path / "run", result)
-    assert any(text in each for each in found), found
+    assert _texts(tmp_path / "run", None) == []
+    texts = _texts(tmp_path / "run", result)
+    assert any(text in each for each in texts), texts
 
 
 RESCORE = "rescore/more.json"
@@ -261,8 +261,8 @@ def test_an_edited_rescore_is_found_where_it_contradicts_the_run(
     rescored(run)
     assert list(differences(read_run(run.root), None)) == []
     run.put(RESCORE, *path, value=value)
-    found = list(differences(read_run(run.root), None))
-    assert any(file == RESCORE and named in text for file, text in found), found
+    texts = list(differences(read_run(run.root), None))
+    assert any(file == RESCORE and named in text for file, text in texts), texts
 
 
 def test_a_rescore_that_is_a_link_is_a_difference(whole: Path, tmp_path: Path) -> None:

