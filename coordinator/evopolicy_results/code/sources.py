@@ -29,10 +29,8 @@ _kept: dict[bytes, tuple[ast.AST, ...]] = {}
 
 
 def parsed(source: bytes) -> tuple[ast.AST, ...]:
-    """All nodes of a Python source, its module first, breadth first; none if it cannot be parsed.
-
-    Several passes read each source of a run, and most checkpoints share sources: the latest trees are kept.
-    """
+    """All nodes of a Python source, its module first, breadth first; none if it cannot be parsed. The latest trees are
+    kept, as several passes read each source and most checkpoints share sources."""
     nodes = _kept.pop(source, None)
     if nodes is None:
         tree = parse(source)
@@ -44,11 +42,8 @@ def parsed(source: bytes) -> tuple[ast.AST, ...]:
 
 
 def read_python_files(system_dir: Path) -> dict[str, bytes]:
-    """Python files under a checkpoint's `system/`, by path relative to it with `/`, sorted. Symlinks, pipes
-    and devices are left out.
-
-    At most `MAX_FILES` files, each at most `MAX_FILE_BYTES`. Raises OSError when the folder cannot be read.
-    """
+    """Regular Python files under a checkpoint's `system/`, by relative path with `/`, sorted: at most `MAX_FILES`,
+    each at most `MAX_FILE_BYTES`. Raises OSError when the folder cannot be read."""
     if not system_dir.is_dir():
         raise FileNotFoundError(f"folder {system_dir} not found")
     files = left_files(system_dir, enter=lambda name: name != "__pycache__" and not name.startswith("."))
@@ -75,11 +70,8 @@ class Module(NamedTuple):
 
 
 def reachable_modules(files: Mapping[str, bytes]) -> dict[str, Module]:
-    """Modules reachable from `policy.py` by any import statement, also inside functions, by dotted name.
-
-    Literal `import_module("x")` and `__import__("x")` count. A package includes its `__init__`. Empty without a
-    `policy.py`.
-    """
+    """Modules reachable from `policy.py` by any import, also inside functions or by a literal `import_module("x")`, by
+    dotted name. A package includes its `__init__`. Empty without a `policy.py`."""
     by_name = {_module_name(path): path for path in files}
     depth = 1 + max((name.count(".") for name in by_name), default=0)
     modules: dict[str, Module] = {}
@@ -128,15 +120,21 @@ def _imported(module: Module, is_package: bool) -> set[str]:
             if base:
                 targets.add(base)
             targets.update(f"{base}.{alias.name}" if base else alias.name for alias in statement.names)
-    by_call = any(name in module.source for name in (b"import_module", b"__import__"))
-    for node in module.nodes if by_call else ():
-        if not isinstance(node, ast.Call) or not node.args or not isinstance(node.args[0], ast.Constant):
-            continue
-        called, literal = node.func, node.args[0].value
-        name = called.attr if isinstance(called, ast.Attribute) else getattr(called, "id", "")
-        if name in ("import_module", "__import__") and isinstance(literal, str):
-            targets.add(literal)
+    if b"import_module" in module.source or b"__import__" in module.source:
+        targets.update(filter(None, map(called_import, module.nodes)))
     return targets
+
+
+def called_import(node: ast.AST) -> str:
+    """The literal of `import_module("x")` or `__import__("x")`; empty for any other node."""
+    match node:
+        case ast.Call(
+            func=ast.Attribute(attr="import_module" | "__import__")
+            | ast.Name(id="import_module" | "__import__"),
+            args=[ast.Constant(value=str(name)), *_],
+        ):
+            return name
+    return ""
 
 
 def absolute_import(node: ast.ImportFrom, name: str, is_package: bool) -> str:

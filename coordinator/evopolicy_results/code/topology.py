@@ -15,7 +15,8 @@ from __future__ import annotations
 
 import ast
 import re
-from collections.abc import Callable, Iterable, Mapping
+from collections import Counter
+from collections.abc import Iterable, Mapping
 from contextlib import suppress
 
 import msgspec
@@ -27,8 +28,7 @@ _DIGITS = re.compile(r"\d+")
 
 
 class Features(msgspec.Struct, frozen=True, kw_only=True):
-    """Deterministic AST features of a source bundle: the columns of the paper's Table "Realized computational
-    structure"."""
+    """AST features of a source bundle: the columns of the paper's Table "Realized computational structure"."""
 
     functions: int = 0
     """`def` and `async def`, methods included; lambdas are not."""
@@ -50,24 +50,16 @@ def describe(modules: Mapping[str, Module]) -> tuple[str, Features]:
     """Topology (32 hex digits) and features of a bundle's reachable modules."""
     walker = _Walker(set(modules))
     opaque: list[str] = []
+    lines = 0
     for module in modules.values():
+        lines += module.source.count(b"\n") + (not module.source.endswith(b"\n"))
         with suppress(RecursionError):
             if module.nodes:
                 walker.module(module)
                 continue
         opaque.append(stable_hash([module.path, module.source.hex()]))
-    features = Features(
-        functions=walker.functions,
-        branches=walker.branches,
-        loops=walker.loops,
-        depth=walker.depth,
-        state=len(walker.state),
-        nodes=walker.nodes,
-        lines=sum(
-            module.source.count(b"\n") + (not module.source.endswith(b"\n")) for module in modules.values()
-        ),
-    )
-    return stable_hash([canonical(walker.units, walker.names), *sorted(opaque)]), features
+    topology = stable_hash([canonical(walker.units, walker.names), *sorted(opaque)])
+    return topology, Features(**walker.counts, depth=walker.depth, state=len(walker.state), lines=lines)
 
 
 class _Walker:
@@ -77,7 +69,9 @@ class _Walker:
         self.units: list[Unit] = []
         self.names = Names()
         self.state: set[tuple[str, str]] = set()
-        self.functions = self.branches = self.loops = self.depth = self.nodes = 0
+        self.counts: Counter[str] = Counter()
+        """Of functions, branches, loops and nodes."""
+        self.depth = 0
         self._class = ""
         self._instance = ("", "")
         """Class and first parameter of the visited method."""
@@ -94,7 +88,8 @@ class _Walker:
         self, body: Iterable[ast.stmt], scope: Scope, defs: set[str], stored: set[str]
     ) -> list[Unit]:
         """The units of a body. Their definitions go to `defs`, other names to `stored`."""
-        units = [unit for one in body if (unit := self._statement_unit(one, scope, defs)) is not None]
+        structural = (one for one in body if not isinstance(one, _NO_STRUCTURE) and not _is_docstring(one))
+        units = [self._unit(one, scope, defs) for one in structural]
         stored.update(*(unit.stored for unit in units if not unit.is_function))
         return units
 
@@ -118,41 +113,32 @@ class _Walker:
             else:
                 scope.aliases[bound] = alias.name
 
-    def _statement_unit(self, node: ast.stmt, scope: Scope, defs: set[str]) -> Unit | None:
-        """A unit for a statement of a module's or class's body; None for statements that are not structure."""
-        if isinstance(node, _NO_STRUCTURE) or _is_docstring(node):
-            return None
+    def _unit(self, node: ast.stmt, scope: Scope, defs: set[str]) -> Unit:
+        """The unit of a statement of a module's or class's body."""
+        unit = Unit(scope, getattr(node, "name", ""), is_function=isinstance(node, _FUNCTIONS))
         if isinstance(node, _FUNCTIONS):
             defs.add(node.name)
-            unit = Unit(scope, node.name, is_function=True)
             self._function(node, unit, 0)
-            return unit
-        if isinstance(node, ast.ClassDef):
+        elif isinstance(node, ast.ClassDef):
             defs.add(node.name)
-            return self._class_unit(node, scope)
-        unit = Unit(scope, "", is_function=False)
-        if isinstance(node, ast.AnnAssign) and defs is self.names.method_defs:
+            outer, self._class = self._class, f"{self._class}.{node.name}"
+            self._add(unit, "ClassDef", _own_name(node.name))
+            for part in (*node.decorator_list, *node.bases, *node.keywords):
+                self._node(part, unit, 0)
+            names = self.names
+            unit.children = self._units_of(node.body, scope, names.method_defs, names.attribute_names)
+            self._class = outer
+        elif isinstance(node, ast.AnnAssign) and defs is self.names.method_defs:
             # A field to dataclasses, which differs from a plain assignment.
             self._add(unit, "Field")
-            for part in filter(None, (node.target, node.value)):
-                self._node(part, unit, 0)
+            for value in filter(None, (node.target, node.value)):
+                self._node(value, unit, 0)
         else:
             self._statement(node, unit, 0)
         return unit
 
-    def _class_unit(self, node: ast.ClassDef, scope: Scope) -> Unit:
-        unit = Unit(scope, node.name, is_function=False)
-        outer, self._class = self._class, f"{self._class}.{node.name}"
-        self._add(unit, "ClassDef", _own_name(node.name))
-        for part in (*node.decorator_list, *node.bases, *node.keywords):
-            self._node(part, unit, 0)
-        names = self.names
-        unit.children = self._units_of(node.body, scope, names.method_defs, names.attribute_names)
-        self._class = outer
-        return unit
-
     def _function(self, node: ast.FunctionDef | ast.AsyncFunctionDef, unit: Unit, depth: int) -> None:
-        self.functions += 1
+        self.counts["functions"] += 1
         self._add(unit, type(node).__name__, _own_name(node.name))
         for decorator in node.decorator_list:
             self._node(decorator, unit, depth)
@@ -209,34 +195,39 @@ class _Walker:
             self._node(node, unit, depth)
 
     def _node(self, node: ast.AST, unit: Unit, depth: int) -> None:
-        kind = type(node)
-        if (handler := _HANDLERS.get(kind)) is not None:
-            handler(self, node, unit, depth)
-            return
-        if kind in _NESTING:
-            depth = self._nest(depth)
-        if kind in _LOOPS:
-            self.loops += 1
-        elif kind in _CASES:
-            self.branches += 1
-        self._add(unit, kind.__name__)
-        self._fields(node, unit, depth)
+        match node:
+            case ast.Name():
+                self.counts["nodes"] += 1
+                if not isinstance(node.ctx, ast.Load):
+                    unit.stored.add(node.id)
+                unit.tokens.append(("n", node.id))
+            case ast.Constant() | ast.UnaryOp(op=ast.USub() | ast.UAdd()) if _is_number(node):
+                self._add(unit, "#")
+            case ast.Constant():
+                self._add(unit, repr(node.value))
+            case ast.Attribute():
+                self._attribute(node, unit, depth)
+            case ast.JoinedStr():
+                self._f_string(node, unit, depth)
+            case ast.If():
+                self._if(node, unit, depth)
+            case _:
+                kind = type(node)
+                if kind in _NESTING:
+                    depth = self._nest(depth)
+                if kind in _LOOPS | _CASES:
+                    self.counts["loops" if kind in _LOOPS else "branches"] += 1
+                self._add(unit, kind.__name__)
+                self._fields(node, unit, depth)
 
     def _if(self, node: ast.If, unit: Unit, depth: int) -> None:
-        self.branches += 1
+        self.counts["branches"] += 1
         inner = self._nest(depth)
         self._add(unit, "If")
         self._node(node.test, unit, depth)
         self._body(node.body, unit, inner)
         is_elif = len(node.orelse) == 1 and isinstance(node.orelse[0], ast.If)
         self._body(node.orelse, unit, depth if is_elif else inner)
-
-    def _unary(self, node: ast.UnaryOp, unit: Unit, depth: int) -> None:
-        if isinstance(node.op, (ast.USub, ast.UAdd)) and _is_number(node.operand):
-            self._add(unit, "#")
-        else:
-            self._add(unit, "UnaryOp")
-            self._fields(node, unit, depth)
 
     def _fields(self, node: ast.AST, unit: Unit, depth: int) -> None:
         for name in node._fields:
@@ -270,14 +261,8 @@ class _Walker:
         else:
             self._add(unit, repr(value))
 
-    def _name(self, node: ast.Name, unit: Unit, depth: int) -> None:
-        self.nodes += 1
-        if not isinstance(node.ctx, ast.Load):
-            unit.stored.add(node.id)
-        unit.tokens.append(("n", node.id))
-
     def _attribute(self, node: ast.Attribute, unit: Unit, depth: int) -> None:
-        self.nodes += 1
+        self.counts["nodes"] += 1
         if not isinstance(node.ctx, ast.Load):
             self.names.attribute_names.add(node.attr)
             if isinstance(node.ctx, ast.Store) and getattr(node.value, "id", None) == self._instance[1]:
@@ -300,9 +285,6 @@ class _Walker:
         self._node(node.value, unit, depth)
         unit.tokens.append(("a", node.attr))
 
-    def _constant(self, node: ast.Constant, unit: Unit, depth: int) -> None:
-        self._add(unit, "#" if _is_number(node) else repr(node.value))
-
     def _f_string(self, node: ast.JoinedStr, unit: Unit, depth: int) -> None:
         self._add(unit, "JoinedStr")
         for part in node.values:
@@ -323,19 +305,11 @@ class _Walker:
         return depth + 1
 
     def _add(self, unit: Unit, *tokens: str) -> None:
-        self.nodes += 1
+        self.counts["nodes"] += 1
         unit.tokens.extend(tokens)
 
 
 _SKIPPED_FIELDS = frozenset({"ctx", "type_comment", "type_params", "annotation", "returns", "simple", "kind"})
-_HANDLERS: dict[type[ast.AST], Callable[..., None]] = {
-    ast.Name: _Walker._name,
-    ast.Constant: _Walker._constant,
-    ast.Attribute: _Walker._attribute,
-    ast.UnaryOp: _Walker._unary,
-    ast.JoinedStr: _Walker._f_string,
-    ast.If: _Walker._if,
-}
 _NO_STRUCTURE = (ast.Import, ast.ImportFrom, ast.Pass)
 _FUNCTIONS = (ast.FunctionDef, ast.AsyncFunctionDef)
 _LOOPS = frozenset({ast.For, ast.AsyncFor, ast.While})
@@ -352,8 +326,8 @@ def _is_docstring(node: ast.stmt) -> bool:
 
 
 def _is_number(node: ast.expr) -> bool:
-    return (
-        isinstance(node, ast.Constant)
-        and isinstance(node.value, (int, float, complex))
-        and not isinstance(node.value, bool)
-    )
+    """Whether the node is a numeric constant, with a sign or without."""
+    if isinstance(node, ast.UnaryOp):
+        node = node.operand
+    value = node.value if isinstance(node, ast.Constant) else None
+    return isinstance(value, (int, float, complex)) and not isinstance(value, bool)

@@ -1,2 +1,1 @@
-"""Finds places in an agent's log or code that a person should look at: signals with the evidence quoted, never
-verdicts."""
+"""Signals in an agent's log or code that a person should read, with the evidence quoted: never verdicts."""

@@ -4,7 +4,7 @@ observation hashes or cases.
 Only three environments have a list of numbers. Code without a loop is not searched for them: controllers use
 the same.
 
-A table keyed by observations or cases is memory of single episodes. Two forms are found:
+A table keyed by observations or cases is memory of single episodes. Two forms count:
 - a lookup (`table[key]`, `.get(key)`) whose key is a hash or the bytes of a value (`hash`, `hashlib`, `crc32`,
   `tobytes`);
 - a lookup in a literal of sequences by `episode_index`, directly or through a variable or attribute that holds it.
@@ -22,7 +22,7 @@ from functools import lru_cache
 import msgspec
 
 from evopolicy_common.simulators import SIMULATORS
-from evopolicy_results.code.sources import MAX_FILE_BYTES, parsed
+from evopolicy_results.code.sources import MAX_FILE_BYTES, called_import, parsed
 from evopolicy_results.scan.signals import Kind, Signal, signal
 
 _NETWORK = re.compile("socket|urllib|http|requests|httpx|aiohttp|ftplib|smtplib|websockets?|paramiko")
@@ -91,14 +91,15 @@ def _module(nodes: Sequence[ast.AST], lines: list[str], env: str) -> Iterator[Si
             digests = sum(isinstance(key, ast.Constant) and _is_digest(key.value) for key in node.keys)
             if digests >= _FEWEST_KEYS:
                 yield at("table", node, f"a table with {digests} keys that look like digests")
-        key = _lookup(node)
-        if key is None:
-            continue
-        table, value = key
-        if _is_hash(value, hashed):
-            yield at("table", node, "a lookup by a hash or the bytes of a value")
-        elif _name(table) in literals and _is_number(value, numbers):
-            yield at("table", node, "a lookup by episode in a literal of sequences")
+        match node:
+            case (
+                ast.Subscript(value=table, slice=key, ctx=ast.Load())
+                | ast.Call(func=ast.Attribute(value=table, attr="get"), args=[key, *_])
+            ):
+                if _is_hash(key, hashed):
+                    yield at("table", node, "a lookup by a hash or the bytes of a value")
+                elif _name(table) in literals and _is_number(key, numbers):
+                    yield at("table", node, "a lookup by episode in a literal of sequences")
 
 
 def _imports(node: ast.AST) -> Iterator[str]:
@@ -108,9 +109,8 @@ def _imports(node: ast.AST) -> Iterator[str]:
         names = [alias.name for alias in node.names]
     elif isinstance(node, ast.ImportFrom) and node.level == 0:
         names = [f"{node.module}.{alias.name}" for alias in node.names]
-    elif isinstance(node, ast.Call) and _name(node.func) in ("import_module", "__import__") and node.args:
-        literal = node.args[0].value if isinstance(node.args[0], ast.Constant) else None
-        names = [literal] if isinstance(literal, str) else []
+    elif name := called_import(node):
+        names = [name]
     yield from {name.split(".")[0] for name in names if name.split(".")[1:2] != ["spaces"]}
 
 
@@ -118,16 +118,6 @@ def _is_digest(value: object) -> bool:
     if isinstance(value, bytes):
         return len(value) >= 16
     return isinstance(value, str) and _HEX.fullmatch(value) is not None
-
-
-def _lookup(node: ast.AST) -> tuple[ast.expr, ast.expr] | None:
-    """The table and the key of a lookup that reads: `table[key]`, `table.get(key)`, `key in table` is none."""
-    match node:
-        case ast.Subscript(value=table, slice=key, ctx=ast.Load()):
-            return table, key
-        case ast.Call(func=ast.Attribute(value=table, attr="get"), args=[key, *_]):
-            return table, key
-    return None
 
 
 def _name(node: ast.expr) -> str:
@@ -138,11 +128,11 @@ def _name(node: ast.expr) -> str:
 
 
 def _is_hash(node: ast.expr, hashed: Set[str]) -> bool:
-    if isinstance(node, ast.Call):
-        name = _name(node.func)
-        if name in _DIGESTS and isinstance(node.func, ast.Attribute):
+    match node:
+        case ast.Call(func=ast.Attribute(attr=name)) if name in _DIGESTS:
             return True
-        return name in _HASHES and bool(node.args)
+        case ast.Call():
+            return _name(node.func) in _HASHES and bool(node.args)
     return _name(node) in hashed
 
 
@@ -167,40 +157,37 @@ def _tainted(assigned: Sequence[tuple[str, ast.expr]]) -> tuple[frozenset[str], 
 
 def _is_episodes(value: ast.expr) -> bool:
     """Whether a literal holds several sequences, each long enough to be an episode's actions."""
-    members: Sequence[ast.expr] = ()
-    if isinstance(value, ast.Dict | ast.List | ast.Tuple):
-        members = value.values if isinstance(value, ast.Dict) else value.elts
-    long = (isinstance(each, ast.List | ast.Tuple) and len(each.elts) >= _FEWEST_STEPS for each in members)
-    return sum(long) >= 2
+    match value:
+        case ast.Dict(values=members) | ast.List(elts=members) | ast.Tuple(elts=members):
+            sequences = [each for each in members if isinstance(each, ast.List | ast.Tuple)]
+            return sum(len(each.elts) >= _FEWEST_STEPS for each in sequences) >= 2
+    return False
 
 
 def dynamics_constants(nodes: Iterable[ast.AST], env: str) -> dict[float, ast.expr]:
     """The numbers of `env`'s dynamics in a module with their first places; empty for too few of them."""
     numbers, enough = DYNAMICS.get(env, ((), 0))
-    found: dict[float, ast.expr] = {}
+    places: dict[float, ast.expr] = {}
     loops = 0
     for node in nodes if numbers else ():
         loops += isinstance(node, ast.For | ast.While | ast.comprehension)
         if isinstance(node, ast.expr) and (value := _value(node)) is not None:
             for number in numbers:
                 if math.isclose(abs(value), number, rel_tol=_TOLERANCE):
-                    found.setdefault(number, node)
-    return found if loops and len(found) >= enough else {}
+                    places.setdefault(number, node)
+    return places if loops and len(places) >= enough else {}
 
 
 def _value(node: ast.expr) -> float | None:
     """The value of a number, of a product with pi such as `4 * np.pi`, or of a quotient of two numbers."""
-    if not isinstance(node, ast.BinOp):
-        return _float(node)
-    left, right = _float(node.left), _float(node.right)
-    if left is not None and isinstance(node.op, ast.Mult):
-        name = getattr(node.right, "attr", getattr(node.right, "id", ""))
-        return left * math.pi if name == "pi" else None
-    return left / right if left is not None and right and isinstance(node.op, ast.Div) else None
-
-
-def _float(node: ast.expr) -> float | None:
-    # An agent may have written an integer that no float can hold.
-    if isinstance(node, ast.Constant) and isinstance(node.value, float | int) and abs(node.value) < 1e6:
-        return float(node.value)
+    match node:
+        case ast.BinOp(left=factor, op=ast.Mult(), right=ast.Attribute(attr="pi") | ast.Name(id="pi")):
+            number = _value(factor) if isinstance(factor, ast.Constant) else None
+            return None if number is None else number * math.pi
+        case ast.BinOp(left=ast.Constant() as dividend, op=ast.Div(), right=ast.Constant() as by):
+            number, divisor = _value(dividend), _value(by)
+            return number / divisor if number is not None and divisor else None
+        # An agent may have written an integer that no float can hold.
+        case ast.Constant(value=float() | int() as value) if abs(value) < 1e6:
+            return float(value)
     return None

@@ -11,7 +11,7 @@ import ast
 import itertools
 import json
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -24,8 +24,7 @@ from evopolicy_results.scan.signals import Files, Signal, Trajectories, signal
 _WINDOW = 24
 """Consecutive numbers that must agree."""
 _FEWEST_VALUES, _FEWEST_CHANGES = 3, 8
-"""Different numbers, and changes from one to the next, that a window must have: constant and periodic plans have
-few."""
+"""Different numbers, and changes between neighbours, that a window must have: constant and periodic plans have few."""
 _MAX_FILE, _MAX_UNPACKED = 4 << 20, 64 << 20
 _MAX_NUMBERS = 400_000
 """Of a run's checkpoints, and of its trajectories."""
@@ -35,9 +34,7 @@ Window = tuple[float, ...]
 
 def copied_actions(checkpoints: Sequence[tuple[int, Files]], trajectories: Trajectories) -> Iterator[Signal]:
     """A signal for each file of a checkpoint that newly holds actions of an earlier submit's train episodes.
-
-    Trajectories are read only if a later checkpoint holds long runs of numbers that it did not hold before.
-    """
+    Trajectories are read only if a later checkpoint has new long runs of numbers."""
     new = list(_fresh(checkpoints))
     last = max((place for place, (_, fresh) in enumerate(new) if fresh), default=0)
     recorded: dict[Window, int] = {}
@@ -54,16 +51,15 @@ def copied_actions(checkpoints: Sequence[tuple[int, Files]], trajectories: Traje
                 yield signal("copy", f"system/{path}", 0, reason, quote, (index,))
         if place < last:
             for actions in trajectories(index):
-                for window in _windows([_flat(actions)]):
+                for window in _windows(_flat(actions)):
                     recorded.setdefault(window, index)
                 if len(recorded) > _MAX_NUMBERS:
                     return
 
 
 def _fresh(checkpoints: Sequence[tuple[int, Files]]) -> Iterator[tuple[int, dict[str, list[Window]]]]:
-    """The windows of each checkpoint's files that no earlier checkpoint held, until `_MAX_NUMBERS` numbers were
-    read."""
-    left = _MAX_NUMBERS
+    """The windows of each checkpoint's files that no earlier one held, until `_MAX_NUMBERS` numbers were read."""
+    remaining = _MAX_NUMBERS
     own: set[Window] = set()
     known: set[tuple[str, bytes]] = set()
     for index, files in checkpoints:
@@ -72,33 +68,30 @@ def _fresh(checkpoints: Sequence[tuple[int, Files]]) -> Iterator[tuple[int, dict
         for path, data in [each for each in files.items() if each not in known]:
             known.add((path, data))
             for numbers in _sequences(path, data):
-                left -= len(numbers)
-                if left < 0:
+                remaining -= len(numbers)
+                if remaining < 0:
                     return
-                found = [each for each in _windows([numbers]) if each not in own]
-                if found:
-                    fresh.setdefault(path, []).extend(found)
-        own.update(window for found in fresh.values() for window in found)
+                if new := [each for each in _windows(numbers) if each not in own]:
+                    fresh.setdefault(path, []).extend(new)
+        own.update(*fresh.values())
         yield index, fresh
 
 
-def _windows(sequences: Iterable[Sequence[float]]) -> Iterator[Window]:
-    """The windows that vary, and neither repeat with a short period nor have one step: tables of such numbers are
-    everywhere."""
-    for numbers in sequences:
-        n = len(numbers) - _WINDOW + 1
-        if n < 1:
-            continue
-        values = np.array(numbers)
-        varied = _in_each(values[1:] != values[:-1], n) >= _FEWEST_CHANGES
-        for period in range(1, 9):
-            varied &= _in_each(values[period:] == values[:-period], n) < _WINDOW - period
-        steps = np.array([round(other - one, 9) for one, other in itertools.pairwise(numbers)])
-        varied &= _in_each(steps[1:] == steps[:-1], n) < _WINDOW - 2
-        for start in np.flatnonzero(varied).tolist():
-            window = tuple(numbers[start : start + _WINDOW])
-            if len(set(window)) >= _FEWEST_VALUES:
-                yield window
+def _windows(numbers: Sequence[float]) -> Iterator[Window]:
+    """The windows that vary, and neither repeat with a short period nor have one step, as common tables do."""
+    n = len(numbers) - _WINDOW + 1
+    if n < 1:
+        return
+    values = np.array(numbers)
+    varied = _in_each(values[1:] != values[:-1], n) >= _FEWEST_CHANGES
+    for period in range(1, 9):
+        varied &= _in_each(values[period:] == values[:-period], n) < _WINDOW - period
+    steps = np.array([round(other - one, 9) for one, other in itertools.pairwise(numbers)])
+    varied &= _in_each(steps[1:] == steps[:-1], n) < _WINDOW - 2
+    for start in np.flatnonzero(varied).tolist():
+        window = tuple(numbers[start : start + _WINDOW])
+        if len(set(window)) >= _FEWEST_VALUES:
+            yield window
 
 
 def _in_each(flags: NDArray[np.bool_], n: int) -> NDArray[np.int64]:
@@ -108,15 +101,15 @@ def _in_each(flags: NDArray[np.bool_], n: int) -> NDArray[np.int64]:
 
 
 def _flat(actions: Sequence[Any]) -> list[float]:
-    found: list[float] = []
+    numbers: list[float] = []
     for action in actions:
         try:
-            found += [_rounded(value) for value in np.asarray(action, dtype=np.float64).reshape(-1)]
+            numbers += [_rounded(value) for value in np.asarray(action, dtype=np.float64).reshape(-1)]
         except (TypeError, ValueError, OverflowError):
             return []
-        if len(found) > _MAX_NUMBERS:
+        if len(numbers) > _MAX_NUMBERS:
             break
-    return found
+    return numbers
 
 
 def _rounded(value: float) -> float:

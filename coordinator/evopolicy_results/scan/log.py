@@ -61,7 +61,9 @@ def log_signals(lines: Iterable[bytes]) -> Iterator[Signal]:
             continue
         for value in objects([line]):
             for text in _calls(value):
-                yield from _command(text[:_MAX_COMMAND], number)
+                text = text[:_MAX_COMMAND]
+                for kind, match, reason in _matches(text):
+                    yield signal(kind, f"{PATH}:{number}", number, reason, _line_of(text, match.start()))
 
 
 def _calls(value: dict[str, Any]) -> Iterator[str]:
@@ -71,8 +73,8 @@ def _calls(value: dict[str, Any]) -> Iterator[str]:
             for block in blocks:
                 match block:
                     case {"type": "tool_use", "input": {**arguments}}:
-                        found = map(arguments.get, ("command", "url", "file_path", "path"))
-                        yield from (text for text in found if isinstance(text, str))
+                        texts = map(arguments.get, ("command", "url", "file_path", "path"))
+                        yield from (text for text in texts if isinstance(text, str))
         case {"type": "item.completed" | "item.started", "item": {"command": [*words]}}:
             yield " ".join(text for text in words if isinstance(text, str))
         case {"type": "item.completed" | "item.started", "item": {"command": str(command)}} | {
@@ -82,29 +84,25 @@ def _calls(value: dict[str, Any]) -> Iterator[str]:
             yield command
 
 
-def _command(text: str, line: int) -> Iterator[Signal]:
-    def found(kind: Kind, match: re.Match[str], reason: str) -> Signal:
-        return signal(kind, f"{PATH}:{line}", line, reason, _line_of(text, match.start()))
-
+def _matches(text: str) -> Iterator[tuple[Kind, re.Match[str], str]]:
     for match in _URL.finditer(text):
         host = match[1].strip("[]")
         if not _LOCAL.match(host) and not host.startswith(("%", "{", "<")) and "." in host:
-            yield found("network", match, f"names the host {host[:80]}")
-    for match_, reason in (
-        (_INSTALL.search(text), "installs packages"),
-        (_followed(text, _CLIENT, _HOST), "runs a network client"),
-        (_CLONE.search(text), "fetches a repository"),
-    ):
-        if match_:
-            yield found("network", match_, reason)
+            yield "network", match, f"names the host {host[:80]}"
+    if first := _INSTALL.search(text):
+        yield "network", first, "installs packages"
+    if first := _followed(text, _CLIENT, _HOST):
+        yield "network", first, "runs a network client"
+    if first := _CLONE.search(text):
+        yield "network", first, "fetches a repository"
     for match in _IMPORT.finditer(text):
-        yield found("simulator", match, f"imports {match[1] or match[2]}")
-    if match_ := _followed(text, _INSTALLED, _PACKAGE):
-        yield found("simulator", match_, f"installs {match_[1]}")
+        yield "simulator", match, f"imports {match[1] or match[2]}"
+    if first := _followed(text, _INSTALLED, _PACKAGE):
+        yield "simulator", first, f"installs {first[1]}"
     for match in _OUTSIDE.finditer(text):
-        yield found("outside", match, f"names {match[1][:120]}")
-    if match_ := _SEARCH.search(text):
-        yield found("outside", match_, "lists the whole machine")
+        yield "outside", match, f"names {match[1][:120]}"
+    if first := _SEARCH.search(text):
+        yield "outside", first, "lists the whole machine"
 
 
 def _followed(text: str, first: re.Pattern[str], second: re.Pattern[str]) -> re.Match[str] | None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Iterable, Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -40,36 +41,36 @@ def scan(
 
     `env` and the Python files of the `workspace` are given for a run whose agent must not simulate: numbers of the
     environment's dynamics are searched, and simulators in the workspace."""
-    found: dict[tuple[str, str, str], Signal] = {}
+    signals: dict[tuple[str, str, str], Signal] = {}
     kept = _kept(checkpoints)
     for index, files in kept:
         for one in code_signals(index, files, env):
             key = (one.kind, one.path, one.quote)
-            known = found.setdefault(key, one)
+            known = signals.setdefault(key, one)
             if known is not one:
-                found[key] = msgspec.structs.replace(known, submits=(*known.submits, index))
+                signals[key] = msgspec.structs.replace(known, submits=(*known.submits, index))
     for one in (*copied_actions(kept, trajectories), *log_signals(log)):
-        found.setdefault((one.kind, one.path.partition(":")[0], one.quote), one)
-    known_quotes = {(one.path.rpartition("/")[2], one.quote) for one in found.values()}
+        signals.setdefault((one.kind, one.path.partition(":")[0], one.quote), one)
+    known_quotes = {(one.path.rpartition("/")[2], one.quote) for one in signals.values()}
     for path, source in (workspace or {}).items():
         for one in file_signals(f"workspace/{path}", source, env):
             if one.kind == "simulator" and (path.rpartition("/")[2], one.quote) not in known_quotes:
-                found.setdefault((one.kind, one.path, one.quote), one)
-    ordered = sorted(found.values(), key=lambda one: (one.path, one.line))
+                signals.setdefault((one.kind, one.path, one.quote), one)
+    ordered = sorted(signals.values(), key=lambda one: (one.path, one.line))
     return tuple(one for kind in TITLES for one in [o for o in ordered if o.kind == kind][:MAX_SIGNALS])
 
 
 def _kept(checkpoints: Iterable[tuple[int, Files]]) -> list[tuple[int, Files]]:
     """The files that are searched, each content once in memory, as a run may have thousands of checkpoints."""
     contents: dict[bytes, bytes] = {}
-    left = _MAX_RUN_BYTES
+    remaining = _MAX_RUN_BYTES
     kept: list[tuple[int, Files]] = []
     for index, files in checkpoints:
         searched: dict[str, bytes] = {}
         for path, data in files.items():
             new = 0 if data in contents else len(data)
-            if path.endswith(_SEARCHED) and new <= left:
-                left -= new
+            if path.endswith(_SEARCHED) and new <= remaining:
+                remaining -= new
                 searched[path] = contents.setdefault(data, data)
         kept.append((index, searched))
     return kept
@@ -88,17 +89,15 @@ def workspace_files(workspace: Path) -> dict[str, bytes]:
 
 
 def _files(folder: Path, wanted: Callable[[str], bool]) -> dict[str, bytes]:
-    found: dict[str, bytes] = {}
+    files: dict[str, bytes] = {}
     for path, size in left_files(folder, enter=lambda name: name not in _LIBRARIES):
         name = path.relative_to(folder).as_posix()
         if wanted(name) and size <= _MAX_FILE_BYTES:
-            try:
-                found[name] = read_regular(path, _MAX_FILE_BYTES)
-            except OSError:
-                continue
-            if len(found) >= _MAX_FILES:
-                break
-    return found
+            with suppress(OSError):
+                files[name] = read_regular(path, _MAX_FILE_BYTES)
+        if len(files) >= _MAX_FILES:
+            break
+    return files
 
 
 def log_lines(path: Path | None) -> Iterator[bytes]:
@@ -121,18 +120,18 @@ _rows = msgspec.json.Decoder(_Row)
 
 def feedback_actions(submit: Path) -> Iterator[list[Any]]:
     """The actions of each train episode in a submit's feedback folder."""
-    left = _MAX_ROWS
+    remaining = _MAX_ROWS
     for path in sorted(submit.glob("episodes/*/trajectory.jsonl")):
         actions = []
         try:
             if path.stat().st_size > _MAX_LOG_BYTES:
                 continue
             with open_regular(path) as lines:
-                for line in itertools.islice(lines, left):
-                    left -= 1
+                for line in itertools.islice(lines, remaining):
+                    remaining -= 1
                     actions.append(_rows.decode(line).action)
         except (OSError, *DECODE_ERRORS):
             continue
         yield actions
-        if left <= 0:
+        if remaining <= 0:
             return

@@ -1,7 +1,7 @@
 """The signals of one run, from its log, its checkpoints and its feedback. Nothing is run.
 
 Rules that this module owns:
-- A signal asks for a human look. It is no verdict and changes no score. Its evidence is quoted.
+- A person should read a signal. It is no verdict and changes no score. Its evidence is quoted.
 - The search prefers misses to false alarms: the project's own agents and example policies raise none.
 - An agent may have written anything, so the work is bounded and damaged content raises nothing.
 """
@@ -27,7 +27,7 @@ _MAX_QUOTE = 300
 
 
 class Signal(msgspec.Struct, frozen=True, kw_only=True):
-    """One place that deserves a look."""
+    """One place that a person should read."""
 
     kind: Kind
     path: str
