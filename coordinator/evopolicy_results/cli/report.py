@@ -23,8 +23,7 @@ from evopolicy_common.regular_files import read_given
 from evopolicy_common.terminal import counted, say, say_json, say_lines
 from evopolicy_results.reading.comparability import REMEDIES, UNKNOWN_ISOLATION, MixedRunsError
 from evopolicy_results.reading.parallel import Processes
-from evopolicy_results.reading.reader import load_runs
-from evopolicy_results.reading.rescored import rescored
+from evopolicy_results.reading.reader import load_runs, rescored
 from evopolicy_results.scoring.scores import read_score_csv
 from evopolicy_results.studies.study import Study, study_of
 

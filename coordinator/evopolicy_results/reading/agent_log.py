@@ -70,8 +70,7 @@ class Evidence(msgspec.Struct, frozen=True, kw_only=True):
     read: tuple[str, ...] = ()
     """Feedback paths that the agent's tool calls name, in order, without repeats."""
     messages: tuple[str, ...] = ()
-    """The agent's own messages; the last is the closest to the submit, and its attribution of the result if it gives
-    one."""
+    """The agent's own messages; the last is the closest to the submit, and may say why the result came."""
     images: tuple[str, ...] = ()
 
     @property
@@ -98,9 +97,8 @@ def read_agent_log(path: Path, submits: Sequence[Submit]) -> LogReading:
     if groups.keys() == {None}:
         groups = _by_times(events, submits)
     unplaced = tuple(event.message for event in groups.pop(None, ()) if event.message)
-    return LogReading(
-        by_submit={i: _evidence(own) for i, own in groups.items() if i is not None}, unplaced=unplaced
-    )
+    by_submit = {index: _evidence(own) for index, own in groups.items() if index is not None}
+    return LogReading(by_submit=by_submit, unplaced=unplaced)
 
 
 _Groups = dict[int | None, list[LogEvent]]
@@ -162,46 +160,38 @@ def _events_of(value: dict[str, Any]) -> Iterator[LogEvent]:
         if not isinstance(inner, dict):
             return
         value, at = inner, _stamp(inner) if at is None else at
-    kind = value.get("type")
-    if kind in ("assistant", "user"):
-        message = value.get("message")
-        content = message.get("content") if isinstance(message, dict) else None
-        if isinstance(content, str):
-            content = [{"type": "text", "text": content}]
-        for block in content if isinstance(content, list) else ():
-            if isinstance(block, dict):
-                yield from _claude_block(block, kind == "assistant", at)
-    elif kind == "item.completed" and isinstance(value.get("item"), dict):
-        yield from _codex_item(value["item"], at)
-    elif isinstance(text := value.get("text"), str) and (
-        kind == "stdout" or isinstance(value.get("turn"), int)
-    ):
-        named = _NAMED.match(text) if kind == "stdout" else None
-        yield LogEvent(message=_clip(text), answered=(int(named[1]),) if named else (), at=at)
+    match value:
+        case {"type": "assistant" | "user" as role}:
+            message = value.get("message")
+            content = message.get("content") if isinstance(message, dict) else None
+            blocks = [{"type": "text", "text": content}] if isinstance(content, str) else content
+            for block in blocks if isinstance(blocks, list) else ():
+                match block:
+                    case {"type": "text", "text": str(text)} if role == "assistant" and text.strip():
+                        yield LogEvent(message=_clip(text), at=at)
+                    case {"type": "tool_use"}:
+                        yield _call(block.get("input"), at)
+                    case {"type": "tool_result"}:
+                        yield LogEvent(answered=_answered_submits(block.get("content")), at=at)
+        case {"type": "item.completed", "item": {**item}}:
+            match item.get("type") or item.get("item_type"), item:
+                case "agent_message" | "assistant_message", {"text": str(text)}:
+                    yield LogEvent(message=_clip(text), at=at)
+                case "command_execution", _:
+                    yield _call(item.get("command"), at)
+                    yield LogEvent(answered=_answered_submits(item.get("aggregated_output")), at=at)
+                case "mcp_tool_call" | "file_change", _:
+                    yield _call(item.get("arguments") or item.get("changes"), at)
+        case {"type": "stdout", "text": str(text)}:
+            named = _NAMED.match(text)
+            yield LogEvent(message=_clip(text), answered=(int(named[1]),) if named else (), at=at)
+        case {"turn": int(), "text": str(text)}:
+            yield LogEvent(message=_clip(text), at=at)
 
 
-def _claude_block(block: dict[str, Any], by_agent: bool, at: float | None) -> Iterator[LogEvent]:
-    kind = block.get("type")
-    if kind == "text" and by_agent and isinstance(block.get("text"), str) and block["text"].strip():
-        yield LogEvent(message=_clip(block["text"]), at=at)
-    elif kind == "tool_use":
-        yield _call(_strings(block.get("input")), at)
-    elif kind == "tool_result":
-        yield LogEvent(answered=_answered_submits(_strings(block.get("content"))), at=at)
-
-
-def _codex_item(item: dict[str, Any], at: float | None) -> Iterator[LogEvent]:
-    kind = item.get("type") or item.get("item_type")
-    if kind in ("agent_message", "assistant_message") and isinstance(item.get("text"), str):
-        yield LogEvent(message=_clip(item["text"]), at=at)
-    elif kind == "command_execution":
-        yield _call(_strings(item.get("command")), at)
-        yield LogEvent(answered=_answered_submits(_strings(item.get("aggregated_output"))), at=at)
-    elif kind in ("mcp_tool_call", "file_change"):
-        yield _call(_strings(item.get("arguments") or item.get("changes")), at)
-
-
-def _call(texts: Sequence[str], at: float | None) -> LogEvent:
+def _call(arguments: Any, at: float | None) -> LogEvent:
+    """A tool call, with the paths that its arguments name."""
+    texts = _strings(arguments)
     read = (path.rstrip("./,") for text in texts for path in _FEEDBACK.findall(text) if _is_short(path))
     images = (path for text in texts for path in _images(text) if _is_short(path))
     return LogEvent(read=tuple(dict.fromkeys(read)), images=tuple(dict.fromkeys(images)), at=at)
@@ -219,8 +209,8 @@ def _is_short(path: str) -> bool:
     return len(path) <= _MAX_PATH_CHARS
 
 
-def _answered_submits(texts: Sequence[str]) -> tuple[int, ...]:
-    numbers = (match[1] for text in texts for match in _ANSWER.finditer(text))
+def _answered_submits(output: Any) -> tuple[int, ...]:
+    numbers = (match[1] for text in _strings(output) for match in _ANSWER.finditer(text))
     return tuple(dict.fromkeys(int(number) for number in numbers if len(number) <= 9))
 
 

@@ -134,8 +134,7 @@ _BY_SUITE = {
     "jail": _Setting(lambda run: run.record.jail, "the same --jail"),
     "hidden cases": _dimension("hidden_cases", "hidden-cases"),
     "hidden isolation": _Setting(
-        lambda run: run.record.hidden_isolation,
-        concerns=lambda run: run.record.hidden_isolation != "unknown",
+        lambda run: run.record.hidden_isolation, concerns=lambda run: run.record.hidden_isolation != "unknown"
     ),
     UNKNOWN_ISOLATION: _Setting(lambda run: run.record.hidden_isolation),
     "model limits": _Setting(
@@ -197,8 +196,7 @@ def mixtures(runs: Iterable[Run]) -> list[Mixture]:
 
 
 def _fingerprint_beside(runs: list[Run]) -> Callable[[Run], str]:
-    """Returns a function for the parts of a run's fingerprint that differ among `runs`, and its overrides by the
-    operator."""
+    """A function for the parts of a run's fingerprint that differ among `runs`, and the operator's overrides."""
     compared = comparable([run.record.versions.fingerprint for run in runs])
     items = {id(run): set(parts.items()) for run, parts in zip(runs, compared, strict=True)}
     common = set.intersection(*items.values())

@@ -41,10 +41,8 @@ _FAMILY = re.compile(r"[a-z0-9_]{1,40}")
 
 
 def learn_names(records: Iterable[RunRecord]) -> None:
-    """Takes from runs, for this process, the titles and families of environments that the catalogue lacks.
-
-    They are shown where all runs of an environment tell the same.
-    """
+    """Takes from runs, for this process, the titles and families of environments that the catalogue lacks. They are
+    shown where all runs of an environment agree."""
     for record in records:
         if record.env not in catalogue.entries() and (record.env_title or record.env_family):
             names = names_in_runs.setdefault(record.env, set())

@@ -55,30 +55,26 @@ class PublishedSummary(msgspec.Struct, frozen=True, kw_only=True):
         return len(self.env_instances)
 
 
-_summary = msgspec.json.Decoder(PublishedSummary)
-
-
-def is_published(value: Any) -> bool:
-    """Whether a decoded `run.json` is the published software's."""
-    return (
-        isinstance(value, dict)
-        and value.get("schema_version") == PUBLISHED_SCHEMA
-        and "record_version" not in value
-    )
-
-
 def read_summary(path: Path) -> PublishedSummary | None:
     """A submit's summary; None when it is missing. Raises ProtocolError when it is damaged."""
     try:
-        return _summary.decode(read_regular(path))
+        return msgspec.json.decode(read_regular(path), type=PublishedSummary)
     except FileNotFoundError:
         return None
     except (OSError, *DECODE_ERRORS) as error:
         raise ProtocolError(f"not a submit summary: {error}") from error
 
 
-def read_record(folder: Path, record: dict[str, Any]) -> RunRecord:
-    """Converts a decoded `run.json` of the published software to our record. Raises ProtocolError when damaged."""
+def read_record(folder: Path, data: bytes) -> RunRecord | None:
+    """Converts the bytes of a `run.json` of the published software to our record; None for one of ours. Raises
+    ProtocolError when it is damaged, or no JSON, which has no NaN, half characters or numbers beyond floats."""
+    try:
+        record = msgspec.json.decode(data)
+    except DECODE_ERRORS as error:
+        raise ProtocolError(f"not a run record: {error}") from error
+    ours = not isinstance(record, dict) or "record_version" in record
+    if ours or record.get("schema_version") != PUBLISHED_SCHEMA:
+        return None
     outcome, timing, versions = (_object(record, name) for name in ("outcome", "timing", "versions"))
     artifacts = {name: place for name, place in _object(record, "artifacts").items() if name in _ARTIFACTS}
     feedback = folder / str(artifacts.get("feedback", "workspace/feedback"))
@@ -86,6 +82,7 @@ def read_record(folder: Path, record: dict[str, Any]) -> RunRecord:
     model, env = _names(folder, record, summaries)
     heldout = outcome.get("heldout_returns") or ()
     try:
+        has_published_cases = len(heldout) == HIDDEN_COUNTS["published-data"][1]
         return RunRecord(
             record_version=PUBLISHED,
             protocol_version=str(record.get("protocol_version", UNKNOWN)),
@@ -109,9 +106,7 @@ def read_record(folder: Path, record: dict[str, Any]) -> RunRecord:
                 step_limit="published",
                 failed_episodes="end-submit",
                 hidden_evaluation="pool",
-                profile="published-data"
-                if len(heldout) == HIDDEN_COUNTS["published-data"][1]
-                else "published",
+                profile="published-data" if has_published_cases else "published",
             ),
             timing=msgspec.convert(timing, Timing),
             outcome=msgspec.convert(
@@ -145,13 +140,13 @@ def _object(fields: dict[str, Any], name: str) -> dict[str, Any]:
 def _names(folder: Path, record: dict[str, Any], summaries: list[PublishedSummary]) -> tuple[str, str]:
     """Model and environment: as recorded, or from `runs/<model>/<env>/<exp-id>`, where `_` may replace an
     environment's `/`."""
-    above = folder.parent
-    name, parents = f"{above.parent.name}/{above.name}", (above.parent, above.parent.parent)
-    by_path = {env: parents[0].name for env in catalogue.entries() if env.replace("/", "_") == above.name}
-    by_path |= {env: parents[1].name for env in catalogue.entries() if env == name}
-    recorded_env = record.get("env") or next((one.env for one in summaries if one.env), None)
-    env = str(recorded_env or next(iter(by_path), above.name))
-    return str(record.get("model") or by_path.get(env, above.parent.name)), env
+    above, two_above = folder.parent, folder.parent.parent
+    by_path = {env: two_above.name for env in catalogue.entries() if env.replace("/", "_") == above.name}
+    whole = f"{two_above.name}/{above.name}"
+    by_path |= {env: two_above.parent.name for env in catalogue.entries() if env == whole}
+    env = record.get("env") or next((one.env for one in summaries if one.env), None)
+    env = str(env or next(iter(by_path), above.name))
+    return str(record.get("model") or by_path.get(env, two_above.name)), env
 
 
 def _budget(folder: Path, record: dict[str, Any], summaries: list[PublishedSummary]) -> int:
@@ -159,13 +154,12 @@ def _budget(folder: Path, record: dict[str, Any], summaries: list[PublishedSumma
     budget = _object(record, "experiment_dimensions").get("episode_budget")
     if isinstance(budget, int):
         return budget
-    first = next(iter(sorted((folder / "checkpoints").glob("submit_*"))), None)
+    first = min((folder / "checkpoints").glob("submit_*"), default=None)
     meta = None if first is None else read_meta(first, 0)
     if meta is not None:
         return meta.remaining_budget_before
-    return next(
-        (one.remaining_budget + one.n_episodes for one in summaries if one.remaining_budget is not None), 0
-    )
+    known = (one.remaining_budget + one.n_episodes for one in summaries if one.remaining_budget is not None)
+    return next(known, 0)
 
 
 def _best(outcome: dict[str, Any]) -> int | None:
@@ -173,11 +167,10 @@ def _best(outcome: dict[str, Any]) -> int | None:
     best = outcome.get("best_submit_index")
     if best is not None:
         return int(best)
-    auxiliary = _object(outcome, "auxiliary")
+    auxiliary, scores = _object(outcome, "auxiliary"), _object(outcome, "val_scores")
     wanted, by_submit = auxiliary.get("code_metrics_best"), _object(auxiliary, "code_metrics_by_submit")
     if wanted is None:
         return None
-    scores = _object(outcome, "val_scores")
 
     def rank(index: int) -> tuple[float, int]:
         score = scores.get(str(index))
@@ -185,12 +178,3 @@ def _best(outcome: dict[str, Any]) -> int | None:
 
     equal = (int(index) for index, metrics in by_submit.items() if metrics == wanted and index.isdecimal())
     return max(equal, key=rank, default=None)
-
-
-def decode(data: bytes) -> Any:
-    """`run.json` as plain values. Raises ProtocolError when it is not JSON, which has no NaN, half characters or
-    numbers beyond floats."""
-    try:
-        return msgspec.json.decode(data)
-    except DECODE_ERRORS as error:
-        raise ProtocolError(f"not a run record: {error}") from error

@@ -3,11 +3,13 @@ crash.
 
 A run is complete when its `run.json` is readable and has status `completed` or `no_ok_submit`. All other data come
 from the files that the agent saw (`summary.json`) and from the immutable checkpoints; only `run.json` has the hidden
-scores. Policies are parsed, never run. Runs of the published software are read too (`published`).
+scores. Policies are parsed, never run. Runs of the published software are read too (`published`). A re-score
+(`rescore/NAME.json`) replaces the held-out results, and never the selection.
 """
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -17,14 +19,22 @@ from typing import Any
 import msgspec
 from msgspec.structs import replace
 
-from evopolicy_common.errors import ProtocolError
+from evopolicy_common.errors import ConfigError, ProtocolError
 from evopolicy_common.messages.bounds import check_plausible
 from evopolicy_common.messages.environment import Split
 from evopolicy_common.messages.gateway import REJECTED
+from evopolicy_common.records.aggregates import mean, std
 from evopolicy_common.records.newest import described
 from evopolicy_common.records.policies.checkpoints import policy_folder, read_meta
+from evopolicy_common.records.rescores import Rescored, RescoreRecord, read_rescore
 from evopolicy_common.records.run_files import RUN_JSON, check_places, run_folders, submit_folders
-from evopolicy_common.records.run_record import RunRecord, decode_run_record
+from evopolicy_common.records.run_record import (
+    PolicyFailureRecord,
+    ReferenceScore,
+    RunRecord,
+    decode_run_record,
+)
+from evopolicy_common.records.splits import SPLITS
 from evopolicy_common.records.summary import Summary, decode_summary
 from evopolicy_common.regular_files import read_regular
 from evopolicy_results.code.line_diff import n_changed
@@ -56,55 +66,38 @@ class UnreadableRunError(Exception):
 def find_run_dirs(paths: Iterable[Path]) -> tuple[list[Path], list[LeftOut]]:
     """As `run_folders`; paths without a run directory are returned with the reason."""
     folders, without = run_folders(paths)
-    return folders, [
-        LeftOut(
-            path=path,
-            reason=f"this is {text}"
-            if (text := described(path))
-            else "no run directory here"
-            if path.is_dir()
-            else "a file, not a run directory"
-            if path.exists()
-            else "no such folder",
-        )
-        for path in without
-    ]
+    left_out = []
+    for path in without:
+        if text := described(path):
+            reason = f"this is {text}"
+        elif path.is_dir():
+            reason = "no run directory here"
+        else:
+            reason = "a file, not a run directory" if path.exists() else "no such folder"
+        left_out.append(LeftOut(path=path, reason=reason))
+    return folders, left_out
 
 
 def load_runs(
-    paths: Iterable[Path],
-    *,
-    processes: Processes = ALONE,
-    progress: Callable[[int, int], None] | None = None,
+    paths: Iterable[Path], *, processes: Processes = ALONE, progress: Callable[[int, int], None] | None = None
 ) -> Loaded:
-    """Reads all complete runs at or under `paths`, and lists what is left out with the reason.
-
-    `processes` read in parallel; `progress` is called with (done, total). A run with the software, entry, environment,
-    experiment id and repeat of an earlier one is left out as its duplicate.
-    """
+    """Reads all complete runs at or under `paths`, and lists the others with the reason, duplicates of an earlier run
+    too. `processes` read in parallel; `progress` is called with (done, total)."""
     folders, left_out = find_run_dirs(paths)
     read = processes.map(read_or_explain, folders, lambda folder, why: LeftOut(path=folder, reason=why))
-    runs: list[Run] = []
-    seen: dict[tuple[bool, str, str, str, int], Path] = {}
-    for done, result in enumerate(read, start=1):
+    seen: dict[tuple[bool, str, str, str, int], Run] = {}
+    for done, run in enumerate(read, start=1):
         if progress is not None:
             progress(done, len(folders))
-        if isinstance(result, LeftOut):
-            left_out.append(result)
+        if isinstance(run, LeftOut):
+            left_out.append(run)
             continue
-        if of := result.record.replay_of:
-            left_out.append(LeftOut(path=result.path, reason=f"a replay of run {of}, and no run of its own"))
-            continue
-        key = (result.is_published, result.entry, result.env, result.record.exp_id, result.record.repeat)
-        if key in seen:
-            left_out.append(LeftOut(path=result.path, reason=f"repeats the run in {seen[key]}"))
-            continue
-        seen[key] = result.path
-        runs.append(result)
-    return Loaded(runs=reconciled(runs), left_out=tuple(left_out))
-
-
-SPLITS: tuple[Split, ...] = ("train", "validation", "heldout")
+        key = (run.is_published, run.entry, run.env, run.record.exp_id, run.record.repeat)
+        if of := run.record.replay_of:
+            left_out.append(LeftOut(path=run.path, reason=f"a replay of run {of}, and no run of its own"))
+        elif (first := seen.setdefault(key, run)) is not run:
+            left_out.append(LeftOut(path=run.path, reason=f"repeats the run in {first.path}"))
+    return Loaded(runs=reconciled(list(seen.values())), left_out=tuple(left_out))
 
 
 def reconciled(runs: Sequence[Run]) -> tuple[Run, ...]:
@@ -114,36 +107,30 @@ def reconciled(runs: Sequence[Run]) -> tuple[Run, ...]:
     The published software records the hash of a case file's bytes, and we also that of the cases which a run used. A
     run of ours on the same file therefore tells which cases a published run used.
     """
-    ours = [run for run in runs if not run.is_published]
-    entries = {run.entry for run in ours}
+    entries = {run.entry for run in runs if not run.is_published}
     used: dict[tuple[Split, str], dict[str, set[int]]] = {}
-    for run in ours:
-        for split in SPLITS:
-            versions = run.record.versions
+    for run, split in itertools.product(runs, SPLITS):
+        if not run.is_published:
+            versions, n = run.record.versions, getattr(run.record.experiment_dimensions, f"n_{split}")
             by_cases = used.setdefault((split, versions.file_hash(split)), {})
-            by_cases.setdefault(versions.cases_hash(split), set()).add(_n_cases(run, split))
+            by_cases.setdefault(versions.cases_hash(split), set()).add(n)
 
     def reconcile(run: Run) -> Run:
         agent, versions = run.record.agent, run.record.versions
-        hashes: dict[Split, str] = {}
+        hashes = dict(versions.cases_hashes)
         for split in SPLITS:
-            n, known = _n_cases(run, split), used.get((split, versions.file_hash(split)), {})
+            n = getattr(run.record.experiment_dimensions, f"n_{split}")  # 0 if unknown
             # Several runs of ours may have used different numbers of cases of the file.
-            fitting = [cases for cases, counts in known.items() if not n or n in counts]
+            by_cases = used.get((split, versions.file_hash(split)), {})
+            fitting = [cases for cases, counts in by_cases.items() if not n or n in counts]
             if len(fitting) == 1:
                 hashes[split] = fitting[0]
         if run.entry in entries:
             agent = replace(agent, entry=f"{run.entry} ({published.HARNESS})")
-        versions = replace(versions, cases_hashes={**versions.cases_hashes, **hashes})
+        versions = replace(versions, cases_hashes=hashes)
         return replace(run, record=replace(run.record, agent=agent, versions=versions))
 
     return tuple(reconcile(run) if run.is_published else run for run in runs)
-
-
-def _n_cases(run: Run, split: Split) -> int:
-    """0 if unknown."""
-    n: int = getattr(run.record.experiment_dimensions, f"n_{split}")
-    return n
 
 
 def read_or_explain(folder: Path) -> Run | LeftOut:
@@ -187,23 +174,20 @@ def _signals(run: Run) -> tuple[Signal, ...]:
     checkpoints = (
         (submit.index, policy_files(policy_folder(run.checkpoint(submit.index)))) for submit in run.submits
     )
-    log = log_lines(run.path / (run.record.artifacts.logs_agent or "logs/agent.jsonl"))
-
-    def trajectories(index: int) -> Iterator[list[Any]]:
-        return feedback_actions(run.feedback(index))
-
-    if run.simulation_allowed:
-        return scan(checkpoints, log, trajectories)
-    return scan(checkpoints, log, trajectories, env=run.env, workspace=workspace_files(run.workspace))
+    return scan(
+        checkpoints,
+        log_lines(run.path / (run.record.artifacts.logs_agent or "logs/agent.jsonl")),
+        lambda index: feedback_actions(run.feedback(index)),
+        env="" if run.simulation_allowed else run.env,
+        workspace={} if run.simulation_allowed else workspace_files(run.workspace),
+    )
 
 
 def _read_record(folder: Path) -> RunRecord:
     try:
         with _naming(RUN_JSON):
             data = read_regular(folder / RUN_JSON)
-            value = published.decode(data)
-            ours = not published.is_published(value)
-            record = decode_run_record(data) if ours else published.read_record(folder, value)
+            record = published.read_record(folder, data) or decode_run_record(data)
             check_places(folder, record.artifacts)
     except FileNotFoundError as error:
         raise UnreadableRunError("unfinished: run.json is missing") from error
@@ -286,11 +270,8 @@ _MAX_DESCRIBED = 4096
 
 
 def describe_files(files: Files) -> tuple[Files, Source | None]:
-    """Returns the reachable source files of a bundle's Python files, and their description; None without a
-    `policy.py`.
-
-    Caches recent bundles: retests and policies shared by several runs are parsed once.
-    """
+    """The reachable source files among a bundle's Python files, and their description; None without a `policy.py`.
+    Descriptions of recent bundles are kept, as runs share policies."""
     modules = reachable_modules(files)
     reached = {module.path: module.source for module in modules.values()}
     if not modules:
@@ -311,3 +292,73 @@ def count_changed_lines(before: Files, after: Files) -> int:
     """Lines removed plus lines added between two source bundles, file by file; a renamed file counts twice."""
     pairs = [(before.get(path, b""), after.get(path, b"")) for path in {*before, *after}]
     return sum(n_changed(old.splitlines(), new.splitlines()) for old, new in pairs if old != new)
+
+
+_SHOWN = 4
+_HELDOUT: Split = "heldout"
+
+
+def rescored(runs: Sequence[Run], name: str) -> list[Run]:
+    """The runs with the held-out results of their re-score `name`; runs without a selected checkpoint stay as they are.
+    Raises ConfigError when a run has no such re-score, or one of another run."""
+    missing, out = [], []
+    for run in runs:
+        best = run.record.outcome.best_submit_index
+        if run.score is None or best is None:
+            out.append(run)
+            continue
+        try:
+            record = read_rescore(run.path, name)
+        except ProtocolError as error:
+            raise ConfigError(str(error)) from error
+        if record is None:
+            missing.append(str(run.path))
+        elif (record.run, record.env, record.selected) != (run.record.run, run.env, best):
+            raise ConfigError(
+                f"{run.path}: its re-score {name} is one of another run; remove it and re-score the run"
+            )
+        elif (played := record.checkpoint(best)) is None or not record.random_returns:
+            raise ConfigError(f"{run.path}: its re-score {name} is incomplete; repeat `evopolicy rescore`")
+        else:
+            out.append(_replaced(run, record, played))
+    if missing:
+        more = f" and {len(missing) - _SHOWN} more" if len(missing) > _SHOWN else ""
+        raise ConfigError(
+            f"no re-score {name} of {', '.join(missing[:_SHOWN])}{more}: play it with `evopolicy rescore RUN… --name"
+            f" {name}`, or leave these runs out"
+        )
+    return out
+
+
+def _replaced(run: Run, record: RescoreRecord, played: Rescored) -> Run:
+    outcome, versions, random = run.record.outcome, run.record.versions, record.random_returns
+    categories: dict[str, Any] = {**played.failures}
+    failures = [each for each in outcome.policy_failures if each.split != _HELDOUT] + [
+        PolicyFailureRecord(
+            split=_HELDOUT, submit_index=record.selected, episode=int(case), category=category
+        )
+        for case, category in sorted(categories.items())
+    ]
+    replaced = replace(
+        run.record,
+        outcome=replace(
+            outcome,
+            final_score=played.mean,
+            heldout_mean_return=played.mean,
+            heldout_std_return=std(played.returns),
+            heldout_returns=tuple(played.returns),
+            # As in a run's own result: a rate over the episodes that report it would leave failed ones out.
+            heldout_successes=() if None in played.successes else tuple(map(bool, played.successes)),
+            policy_failures=tuple(failures),
+            random_reference=ReferenceScore(
+                mean_return=mean(random), std_return=std(random), returns=tuple(random), seeded_by="case"
+            ),
+        ),
+        experiment_dimensions=replace(run.record.experiment_dimensions, n_heldout=record.n_cases),
+        versions=replace(
+            versions,
+            cases_hashes={**versions.cases_hashes, _HELDOUT: record.cases_hash},
+            data_secret=versions.data_secret and record.cases_secret,
+        ),
+    )
+    return replace(run, record=replaced, rescore=record)

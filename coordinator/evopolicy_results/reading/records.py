@@ -59,8 +59,7 @@ class Submit(msgspec.Struct, frozen=True, kw_only=True):
     source: Source | None = None
     """None when there is no readable checkpoint."""
     changed_lines: int | None = None
-    """Lines added plus lines removed in the source bundle since the previous ok submit; None for the first, or if
-    unknown."""
+    """Lines added plus removed in the source bundle since the previous ok submit; None for the first, or if unknown."""
 
     @property
     def label(self) -> str:
@@ -160,7 +159,7 @@ class Run(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class LeftOut(msgspec.Struct, frozen=True, kw_only=True):
-    """A path that looked like a run and is not part of the analysis."""
+    """A path that was read as a run and is not part of the analysis."""
 
     path: Path
     reason: str

@@ -21,9 +21,8 @@ from evopolicy_results.reading.environments import (
     suites_of,
 )
 from evopolicy_results.reading.parallel import Processes
-from evopolicy_results.reading.reader import load_runs
+from evopolicy_results.reading.reader import load_runs, rescored
 from evopolicy_results.reading.records import LeftOut, Run
-from evopolicy_results.reading.rescored import rescored
 from evopolicy_results.scoring.evolution import Evolution, evolutions
 from evopolicy_results.scoring.normalised import Normalised, normalised, scales_of
 from evopolicy_results.scoring.ranking import Leaderboard, leaderboard

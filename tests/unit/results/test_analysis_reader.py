@@ -21,9 +21,8 @@ from waiting import wait_until
 from evopolicy_common.records.rescores import Rescored, RescoreRecord, encode_rescore, rescore_path
 from evopolicy_results.reading.comparability import IN_QUESTION, UNKNOWN_ISOLATION, MixedRunsError, mixtures
 from evopolicy_results.reading.parallel import Processes
-from evopolicy_results.reading.reader import count_changed_lines, find_run_dirs, load_runs, read_run
+from evopolicy_results.reading.reader import count_changed_lines, find_run_dirs, load_runs, read_run, rescored
 from evopolicy_results.reading.records import rows
-from evopolicy_results.reading.rescored import rescored
 from evopolicy_results.studies.study import study
 
 VERSIONS = [

@@ -335,7 +335,7 @@ def test_a_published_record_with_impossible_values_is_left_out(tmp_path: Path, v
     text = json.dumps(json.loads((run / "run.json").read_text()) | {"model": "@"}).replace('"@"', value)
     (run / "run.json").write_text(text)
     with pytest.raises(ProtocolError):
-        published.decode(text.encode())
+        published.read_record(run, text.encode())
     (found,) = load_runs([tmp_path]).left_out
     assert found.reason.startswith("run.json: not a run record"), found.reason
 
