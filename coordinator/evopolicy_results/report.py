@@ -70,22 +70,21 @@ def write_report(
     single runs are left out, which saves most of the time and space of a large report. `processes` draw figures
     and write the pages of runs; call it on the main thread.
     """
-    tell = progress if progress is not None else lambda what, done, total: None
+    tell = progress or (lambda what, done, total: None)
     check_folder(out, _OURS.__contains__, "report")
     for name in _FOLDERS:
         shutil.rmtree(out / name, ignore_errors=True)
+    for name in ("figures", "tables"):
+        (out / name).mkdir(parents=True, exist_ok=True)
     look = looks(study.entries, study.reference)
-    trace_links = {run.name: f"traces/{slug(run)}.html" for run in study.runs} if traces else {}
-    tables = tables_of(study)
-    plots: list[Plot] = []
-    submits: list[dict[str, Any]] = []
-    drawings = drawings_of(study)
-    by_env = grouped(study.runs if traces else (), lambda run: run.env)
+    tables, drawings = tables_of(study), drawings_of(study)
     pages = [
         partial(_page, run, out, look.get(run.entry), _beside(run, runs, look))
-        for runs in by_env.values()
+        for runs in grouped(study.runs if traces else (), lambda run: run.env).values()
         for run in runs
     ]
+    plots: list[Plot] = []
+    submits: list[dict[str, Any]] = []
     stages: list[partial[Any]] = [*drawings, *pages]
     work = [(names_in_runs, each) for each in stages]
     for done, made in enumerate(processes.map(_made, work, _lost, at_once=1), start=1):
@@ -111,7 +110,7 @@ def write_report(
         looks=look,
         tables=tables,
         figures=plots,
-        trace_links=trace_links,
+        trace_links={run.name: f"traces/{slug(run)}.html" for run in study.runs if traces},
         replay_links=_write_replays(study, out, look),
     )
     return write_file(out / "index.html", text)
@@ -203,19 +202,19 @@ def _copied(path: Path, folder: Path, stem: str) -> str | None:
 
 
 def _write_replays(study: Study, out: Path, look: Mapping[str, Look]) -> dict[str, str]:
-    by_env: dict[str, list[PlayedEpisode]] = {}
-
     def copied(run: Run, path: str | None, number: int) -> str | None:
-        """None too for what is outside the run directory, or no image or video."""
+        """None too for a file outside the run directory, and for any but an image or video."""
         source = (run.path / (path or "")).resolve()
         if not source.is_relative_to(run.path.resolve()) or source.suffix.lower() not in _MEDIA:
             return None
         return _copied(source, out / "replays", f"media/{slug(run)}-{number:03d}")
 
-    for run in study.runs:
-        for number, replay in enumerate(run.record.replays):
-            video, strip = copied(run, replay.path, number), copied(run, replay.filmstrip, number)
-            by_env.setdefault(run.env, []).append(PlayedEpisode(run, replay, video, strip))
+    played = [
+        PlayedEpisode(run, each, copied(run, each.path, number), copied(run, each.filmstrip, number))
+        for run in study.runs
+        for number, each in enumerate(run.record.replays)
+    ]
+    by_env = grouped(played, lambda each: each.run.env)
     links: dict[str, str] = {}
     for env in ordered_environments(by_env):
         links[env] = f"replays/{_NO_NAME.sub('-', env)}.html"

@@ -1,5 +1,5 @@
 """Edit types: the kind of change of each score-bearing submit, and its effect (paper, mechanism section, Table "edit
-types").
+types"); edit size against improvement, and realised structure of selected policies (same section, and appendix).
 
 A *transition* goes from one score-bearing submit (ok, with a validation mean) to the next. Its type follows from the
 source bundle's topology, which leaves out numeric constants (`topology`), in this order:
@@ -18,12 +18,15 @@ counted among the excluded. A transition is a *hit* when it strictly raises the 
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping, Sequence
+from statistics import fmean
 
 import msgspec
 
 from evopolicy_common import catalogue
+from evopolicy_results.code.topology import Features
 from evopolicy_results.reading.environments import by_name
 from evopolicy_results.reading.records import EditType, Run, Submit
 
@@ -170,11 +173,8 @@ def demand_of(env: str) -> str | None:
 
 
 def phases(transitions: Sequence[Transition]) -> list[tuple[int, int, str]]:
-    """Bands (from, to, edit type) over consumed episodes: adjacent transitions of one type form one band.
-
-    A submit's band covers its own episodes. Rollbacks and retests are events, not phases: the phase continues through
-    them.
-    """
+    """Bands (from, to, edit type) over consumed episodes, each of adjacent transitions of one type. The phase continues
+    through rollbacks and retests."""
     bands: list[tuple[int, int, str]] = []
     for transition in transitions:
         edit = transition.edit
@@ -191,3 +191,111 @@ def events_of(transition: Transition) -> list[str]:
     """`hit` or `miss`, plus `rollback` or `retest` if the submit is one."""
     outcome = ["hit" if transition.hit else "miss"]
     return outcome + ([transition.edit] if transition.edit in ("rollback", "retest") else [])
+
+
+FEATURES = ("functions", "branches", "loops", "depth", "state")
+"""The paper's five columns, in its order."""
+
+UNCHANGED, DATA_ONLY = "unchanged", "data only"
+BINS = (UNCHANGED, DATA_ONLY, "1–5", "6–20", "21–60", "61–150", "151+")
+"""Edit sizes in changed lines of the source bundle; unchanged: retests; data only: other files changed."""
+_LARGEST = (5, 20, 60, 150)
+"""Largest sizes of the bins from `1–5` on."""
+
+
+class StructureMean(msgspec.Struct, frozen=True, kw_only=True):
+    """Mean features of an entry's selected policies in a demand group: over runs, then over environments."""
+
+    demand: str
+    entry: str
+    harness: str
+    n_environments: int
+    n_runs: int
+    functions: float
+    branches: float
+    loops: float
+    depth: float
+    state: float
+    nodes: float
+    lines: float
+
+
+class EditSizeBin(msgspec.Struct, frozen=True, kw_only=True):
+    """Transitions of one entry whose edit size is in one bin."""
+
+    entry: str
+    label: str
+    """One of `BINS`."""
+    n: int
+    n_visible: int
+    """Number of these with visible means on both sides."""
+    visible_improved: int
+    """Number of these whose visible train mean rose."""
+    validation_improved: int
+    """Number of these whose validation best rose."""
+
+    @property
+    def p_visible(self) -> float | None:
+        """Share whose visible mean rose; None if none can be compared."""
+        return self.visible_improved / self.n_visible if self.n_visible else None
+
+    @property
+    def p_validation(self) -> float | None:
+        """Share that raised the validation best; None for an empty bin."""
+        return self.validation_improved / self.n if self.n else None
+
+
+def structure_means(runs: Sequence[Run]) -> list[StructureMean]:
+    """Rows by demand group (`all` last, over every environment), then entry."""
+    harness = {run.entry: run.harness for run in runs}
+    groups: dict[tuple[str, str], dict[str, list[Features]]] = {}
+    for run in runs:
+        if run.selected is not None and run.selected.source is not None:
+            for group in demand_groups(run.env):
+                by_env = groups.setdefault((group, run.entry), {})
+                by_env.setdefault(run.env, []).append(run.selected.source.features)
+    keys = sorted(groups, key=lambda key: (GROUPS.index(key[0]), by_name(key[1])))
+    return [
+        StructureMean(
+            demand=demand,
+            entry=entry,
+            harness=harness[entry],
+            n_environments=len(by_env),
+            n_runs=sum(map(len, by_env.values())),
+            **{
+                name: fmean(fmean(getattr(one, name) for one in several) for several in by_env.values())
+                for name in (*FEATURES, "nodes", "lines")
+            },
+        )
+        for demand, entry in keys
+        for by_env in [groups[demand, entry]]
+    ]
+
+
+def edit_size_bins(runs: Iterable[Run]) -> list[EditSizeBin]:
+    """Every transition with a known edit size, by entry (sorted) and bin (all bins, including empty ones)."""
+    by_entry: dict[str, dict[str, list[Transition]]] = {}
+    for run in runs:
+        bins = by_entry.setdefault(run.entry, {label: [] for label in BINS})
+        for transition in classify(run.submits):
+            if transition.previous is not None and transition.changed_lines is not None:
+                bins[_bin_of(transition.edit, transition.changed_lines)].append(transition)
+    return [
+        EditSizeBin(
+            entry=entry,
+            label=label,
+            n=len(inside),
+            n_visible=sum(t.mean_improved is not None for t in inside),
+            visible_improved=sum(t.mean_improved is True for t in inside),
+            validation_improved=sum(t.hit for t in inside),
+        )
+        for entry in sorted(by_entry, key=by_name)
+        for label, inside in by_entry[entry].items()
+    ]
+
+
+def _bin_of(edit: EditType, changed_lines: int) -> str:
+    """One of `BINS`. A change without changed lines (line ends, empty module) counts as one line."""
+    if edit in ("retest", "data"):
+        return UNCHANGED if edit == "retest" else DATA_ONLY
+    return BINS[2 + bisect_left(_LARGEST, changed_lines)]

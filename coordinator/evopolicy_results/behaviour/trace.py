@@ -108,10 +108,7 @@ def diff(before: Mapping[str, str], after: Mapping[str, str]) -> list[FileDiff]:
 
 def _images(run: Run, reading: LogReading) -> dict[int, list[Path]]:
     """Images by submit index: new in that checkpoint's `system/`, or in the final workspace and named in its part of
-    the log.
-
-    Workspace images that the log does not name are shown with the last submit.
-    """
+    the log. Workspace images without a name in the log are shown with the last submit."""
     named = {
         Path(name).name: index for index, evidence in reading.by_submit.items() for name in evidence.images
     }

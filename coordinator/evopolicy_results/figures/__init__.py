@@ -11,7 +11,7 @@ import msgspec
 
 from evopolicy_results.figures.plot import Plot
 from evopolicy_results.figures.timelines import timeline_of
-from evopolicy_results.reading.environments import ordered_environments
+from evopolicy_results.reading.environments import grouped, ordered_environments
 from evopolicy_results.studies.palette import looks
 from evopolicy_results.studies.study import Study
 
@@ -35,7 +35,7 @@ _OF_STUDY = (
 def drawings_of(study: Study) -> list[partial[Plot | None]]:
     """The figures that matplotlib draws, in order; None for one without data. Processes can send them."""
     look = looks(study.entries, study.reference)
-    sent = msgspec.structs.replace(study, runs=(), audit=())  # figures need no more
+    sent = msgspec.structs.replace(study, runs=())  # figures need no more
     return [
         partial(_draw, name, suite, sent, look)
         for suite in study.suites
@@ -52,19 +52,11 @@ def _draw(function: str, *args: Any) -> Plot | None:
 def timelines_of(study: Study) -> Iterator[Plot]:
     """The code phases of each environment's runs, as SVG."""
     look = looks(study.entries, study.reference)
-    runs = [run for run in study.runs if run.record.start is None]
-    for env in ordered_environments(run.env for run in runs):
-        plot = timeline_of(env, [run for run in runs if run.env == env], look)
-        if plot is not None:
-            yield plot
+    by_env = grouped((run for run in study.runs if run.record.start is None), lambda run: run.env)
+    yield from filter(None, (timeline_of(env, by_env[env], look) for env in ordered_environments(by_env)))
 
 
 def figures_of(study: Study) -> Iterator[Plot]:
-    """Yields the report's figures in order; figures without data are omitted.
-
-    Each keeps its drawing in memory until it is dropped: write it before taking the next.
-    """
-    for draw in drawings_of(study):
-        if (plot := draw()) is not None:
-            yield plot
+    """Yields the report's figures with data, in order. Each keeps its drawing in memory: write it before the next."""
+    yield from filter(None, (draw() for draw in drawings_of(study)))
     yield from timelines_of(study)

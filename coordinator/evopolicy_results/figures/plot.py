@@ -33,8 +33,6 @@ class Plot(msgspec.Struct, frozen=True, kw_only=True):
     """Alternative text that describes the figure."""
     data: Any
     """JSON-able: the numbers drawn."""
-    group: str
-    """Section of the report."""
     figure: Figure | None = None
     svg: str = ""
     """A stand-alone SVG, if there is no `figure`."""
@@ -51,8 +49,7 @@ _THEME = {INK: "var(--ink)", MUTED: "var(--muted)", GRID: "var(--grid)"}
 
 
 def inline_svg(svg: str, name: str, alt: str) -> str:
-    """The SVG for use inside a page: themed, scaling with its container, labelled for assistive technology, ids
-    unique."""
+    """The SVG for use inside a page: themed, scaled with its container, labelled for screen readers, ids unique."""
     prefix = "f" + hashlib.sha256(name.encode()).hexdigest()[:8] + "-"
     body = _METADATA.sub("", _PROLOGUE.sub("", svg, count=1))
     body = _IDS.sub(lambda match: match.group(1) + prefix, body)

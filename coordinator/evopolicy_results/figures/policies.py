@@ -6,11 +6,10 @@ import math
 from collections.abc import Mapping
 from statistics import fmean
 
-from matplotlib.axes import Axes
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from evopolicy_results.behaviour.audit import PHASES
-from evopolicy_results.behaviour.structure import BINS, DATA_ONLY, FEATURES, UNCHANGED
+from evopolicy_results.behaviour.edits import BINS, DATA_ONLY, FEATURES, UNCHANGED
 from evopolicy_results.figures.plot import INK, MUTED, Plot
 from evopolicy_results.figures.style import handles_of, legend_above, new_figure, write_beside
 from evopolicy_results.reading.environments import by_name
@@ -51,38 +50,31 @@ def hit_rates(study: Study, looks: Mapping[str, Look]) -> Plot | None:
             environments = "All environments" if group == "all" else f"{group.capitalize()} tasks"
             panel.set_title(f"{environments}:\n{edit} edits")
             for place, entry in enumerate(entries):
-                row = table.get((entry, group))
-                n = getattr(row, f"n_{edit}", 0)
-                _hit_row(panel, place, getattr(row, f"hits_{edit}", 0), n, looks[entry])
+                row, look = table.get((entry, group)), looks[entry]
+                n, hits = getattr(row, f"n_{edit}", 0), getattr(row, f"hits_{edit}", 0)
+                if not n:
+                    panel.annotate("none", (0.02, place), va="center", fontsize=8, color=MUTED)
+                    continue
+                panel.hlines(place, *wilson(hits, n), color=look.colour, linewidth=1.8, alpha=0.6)
+                panel.plot(hits / n, place, look.marker, color=look.colour, markersize=6.5, clip_on=False)
+                at = (1.0, place - 0.3)
+                panel.annotate(f"n = {n}", at, ha="right", va="center", fontsize=7, color=MUTED)
             panel.set_xlim(0.0, 1.0)
             panel.set_xticks([0.0, 0.5, 1.0], ["0", "50", "100"])
         figure.supxlabel("Edits that raise the validation best (%)", fontsize=9)
     return Plot(
         name="edit_hits",
         title="Which edits help",
-        caption=(
-            "Share of edits that raise the best validation mean so far, with Wilson's 95 % interval and the number of"
-            " edits. Rollbacks, retests and first submits are in neither."
-        ),
+        caption="Share of edits that raise the best validation mean so far, with Wilson's 95 % interval and"
+        " the number of edits. Rollbacks, retests and first submits are in neither.",
         alt=f"Hit rates of synthesis and parametric edits for {len(entries)} agents.",
         data=rows(study.edit_rates),
         figure=figure,
-        group="edits",
     )
 
 
 def _groups(demands: set[str]) -> list[str]:
     return [group for group in ("synthesis", "tuning") if group in demands] or ["all"]
-
-
-def _hit_row(panel: Axes, place: int, hits: int, n: int, look: Look) -> None:
-    if not n:
-        panel.annotate("none", (0.02, place), va="center", fontsize=8, color=MUTED)
-        return
-    low, high = wilson(hits, n)
-    panel.hlines(place, low, high, color=look.colour, linewidth=1.8, alpha=0.6)
-    panel.plot(hits / n, place, look.marker, color=look.colour, markersize=6.5, clip_on=False)
-    panel.annotate(f"n = {n}", (1.0, place - 0.3), ha="right", va="center", fontsize=7, color=MUTED)
 
 
 def edit_size(study: Study, looks: Mapping[str, Look]) -> Plot | None:
@@ -126,15 +118,12 @@ def edit_size(study: Study, looks: Mapping[str, Look]) -> Plot | None:
     return Plot(
         name="edit_size",
         title="Edit size and improvement",
-        caption=(
-            "Transitions between adjacent score-bearing submits by size of the edit; a mark's area grows with their"
-            " number. An unchanged policy cannot raise the validation best; its visible mean can change, as it may play"
-            " other cases. Data only: files outside the source bundle changed, such as weights."
-        ),
+        caption="Transitions between adjacent score-bearing submits by size of the edit; a mark's area grows"
+        " with their number. An unchanged policy cannot raise the validation best; its visible mean can"
+        " change, as it may play other cases. Data only: files outside the source bundle changed, such as weights.",
         alt=f"Probability of improvement over {len(labels)} edit sizes for {len(entries)} agents.",
         data=rows(study.edit_sizes),
         figure=figure,
-        group="edits",
     )
 
 
@@ -165,14 +154,11 @@ def structure(study: Study, looks: Mapping[str, Look]) -> Plot | None:
     return Plot(
         name="structure",
         title="Realised structure",
-        caption=(
-            "AST features of validation-selected policies (policy.py and the local modules it reaches), mean over each"
-            " demand group's environments."
-        ),
+        caption="AST features of validation-selected policies (policy.py and the local modules it reaches),"
+        " mean over each demand group's environments.",
         alt=f"Dot plots of five code features for {len(lines)} rows of agents and demand groups.",
         data=rows(lines),
         figure=figure,
-        group="structure",
     )
 
 
@@ -205,14 +191,11 @@ def tokens(study: Study, looks: Mapping[str, Look]) -> Plot | None:
     return Plot(
         name="tokens",
         title="Tokens",
-        caption=(
-            "Tokens of a run by environment (symbols) and their mean (bars). Diagnostic: no part of a score. Agents"
-            " that tell nothing of tokens are absent."
-        ),
+        caption="Tokens of a run by environment (symbols) and their mean (bars). Diagnostic: no part of a"
+        " score. Agents that tell nothing of tokens are absent.",
         alt=f"Token use of {len(entries)} agents in three kinds.",
         data=rows(counted),
         figure=figure,
-        group="cost",
     )
 
 
@@ -236,12 +219,9 @@ def wall_time(study: Study, looks: Mapping[str, Look]) -> Plot | None:
     return Plot(
         name="wall_time",
         title="Wall time by phase",
-        caption=(
-            "Mean wall time of a run: the agent alone, waiting for a slot, train episodes, feedback, and hidden"
-            " evaluation."
-        ),
+        caption="Mean wall time of a run: the agent alone, waiting for a slot, train episodes, feedback, and"
+        " hidden evaluation.",
         alt=f"Stacked bars of wall time for {len(entries)} agents.",
         data=means,
         figure=figure,
-        group="cost",
     )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from itertools import zip_longest
 from statistics import fmean
 
 from matplotlib.axes import Axes
@@ -13,10 +14,10 @@ from evopolicy_common.statistics.intervals import Estimate
 from evopolicy_results.behaviour.edits import demand_of
 from evopolicy_results.figures.plot import GRID, INK, Plot
 from evopolicy_results.figures.style import handles_of, legend_above, name_rows, new_figure, write_beside
-from evopolicy_results.reading.environments import family_of, family_title, title_of
+from evopolicy_results.reading.environments import family_of, family_title, grouped, title_of
 from evopolicy_results.reading.records import rows
 from evopolicy_results.scoring.evolution import Evolution, best_at
-from evopolicy_results.scoring.normalised import DEMANDS
+from evopolicy_results.scoring.scores import DEMANDS
 from evopolicy_results.statistics.aggregates import TAUS, Bounded
 from evopolicy_results.studies.palette import REFERENCE, Look
 from evopolicy_results.studies.study import Study, Suite
@@ -30,7 +31,7 @@ def rank_scores(suite: Suite, study: Study, looks: Mapping[str, Look]) -> Plot |
     standings, estimates = suite.board.standings, suite.statistics.standings
     if not any(row.score is not None for row in standings):
         return None
-    families = list(dict.fromkeys(family_of(env) for env in suite.board.environments))
+    families = list(dict.fromkeys(family_of(env) for env in suite.table.environments))
     panels = ["", *families] if len(families) > 1 else [""]
     names = [row.entry for row in standings]
     size = 2.1 + 1.75 * len(panels), 0.9 + 0.3 * len(standings)
@@ -62,14 +63,14 @@ def rank_scores(suite: Suite, study: Study, looks: Mapping[str, Look]) -> Plot |
         + (f" at {best.score:.2f}." if best.score is not None else "."),
         data=rows(standings),
         figure=figure,
-        group="leaderboard",
     )
 
 
 def score_evolution(suite: Suite, study: Study, looks: Mapping[str, Look]) -> Plot | None:
     """Small multiples, one per environment: best validation mean over consumed episodes, one step curve per run."""
     curves = [one for one in study.evolutions if one.env in suite.table.environments and one.steps]
-    envs = [env for env in suite.table.environments if any(one.env == env for one in curves)]
+    by_env = grouped(curves, lambda one: one.env)
+    envs = [env for env in suite.table.environments if env in by_env]
     if not envs:
         return None
     n_columns = min(4, len(envs))
@@ -77,11 +78,11 @@ def score_evolution(suite: Suite, study: Study, looks: Mapping[str, Look]) -> Pl
     shown = [entry for entry in suite.table.agents if any(one.entry == entry for one in curves)]
     size = 2.6 * n_columns if n_columns > 1 else 5.2, 0.7 + 1.75 * n_rows
     with new_figure(*size, nrows=n_rows, ncols=n_columns) as (figure, axes):
-        panels = list(axes.flat)
-        for panel, env in zip(panels, envs, strict=False):
-            _evolution_panel(panel, env, [one for one in curves if one.env == env], suite, looks)
-        for panel in panels[len(envs) :]:
-            panel.set_visible(False)
+        for panel, env in zip_longest(axes.flat, envs):
+            if env is None:
+                panel.set_visible(False)
+            else:
+                _evolution_panel(panel, env, by_env[env], suite, looks)
         figure.supxlabel("Train episodes consumed", fontsize=9)
         below = " " if n_rows > 1 else "\n"
         figure.supylabel(f"Best validation mean{below}return so far", fontsize=9)
@@ -92,15 +93,12 @@ def score_evolution(suite: Suite, study: Study, looks: Mapping[str, Look]) -> Pl
     return Plot(
         name=f"score_evolution_{suite.name}",
         title=f"{suite.title} score evolution",
-        caption=(
-            "Best hidden-validation mean so far over the consumed train budget, one curve a run, rises marked; where"
-            f" an agent has more than {MAX_CURVES} runs, their mean and range from where all have a score."
-            " Reconstructed after the run: agents never see it. Dotted: random reference on the held-out cases."
-        ),
+        caption="Best hidden-validation mean so far over the consumed train budget, one curve a run, rises"
+        f" marked; where an agent has more than {MAX_CURVES} runs, their mean and range from where all have a score."
+        " Reconstructed after the run: agents never see it. Dotted: random reference on the held-out cases.",
         alt=f"Step curves for {len(envs)} environments and {len(shown)} agents.",
         data=rows(curves),
         figure=figure,
-        group="evolution",
     )
 
 
@@ -108,13 +106,12 @@ def _evolution_panel(
     panel: Axes, env: str, curves: Sequence[Evolution], suite: Suite, looks: Mapping[str, Look]
 ) -> None:
     panel.set_title(title_of(env))
-    for entry in dict.fromkeys(one.entry for one in curves):
-        own, look = [one for one in curves if one.entry == entry], looks[entry]
+    for entry, own in grouped(curves, lambda one: one.entry).items():
         if len(own) > MAX_CURVES:
-            _mean_curve(panel, own, look)
-            continue
-        for one in own:
-            _one_curve(panel, one, look, 1.0 if len(own) == 1 else 0.55)
+            _mean_curve(panel, own, looks[entry])
+        else:
+            for one in own:
+                _one_curve(panel, one, looks[entry], 1.0 if len(own) == 1 else 0.55)
     cell = None if suite.table.reference is None else suite.table.cells.get((suite.table.reference, env))
     if cell is not None and cell.mean is not None:
         panel.axhline(cell.mean, color=REFERENCE, linestyle=":", linewidth=1.1)
@@ -176,15 +173,12 @@ def performance_profiles(suite: Suite, study: Study, looks: Mapping[str, Look]) 
     return Plot(
         name=f"profiles_{suite.name}",
         title=f"{suite.title} performance profiles",
-        caption=(
-            "Share of an agent's runs whose normalised score is above each value, over all environments with a scale;"
-            " higher is better. Bands: pointwise 95 % intervals of a stratified bootstrap over runs and their cases, or"
-            " over the cases of single runs; none where resamples show no spread."
-        ),
+        caption="Share of an agent's runs whose normalised score is above each value, over all environments"
+        " with a scale; higher is better. Bands: pointwise 95 % intervals of a stratified bootstrap over runs"
+        " and their cases, or over the cases of single runs; none where resamples show no spread.",
         alt=f"Performance profiles of {len(aggregates)} agents.",
         data=rows(aggregates),
         figure=figure,
-        group="statistics",
     )
 
 
@@ -209,9 +203,9 @@ def normalised_performance(suite: Suite, study: Study, looks: Mapping[str, Look]
             panel.set_title(f"{demand.capitalize()}-dominant (n = {n})")
             for place, agent in enumerate(agents):
                 values = [
-                    cell.value
-                    for (entry, env), cell in suite.normalised.cells.items()
-                    if entry == agent and demand_of(env) == demand and cell.value is not None
+                    value
+                    for (entry, env), value in suite.normalised.cells.items()
+                    if entry == agent and demand_of(env) == demand and value is not None
                 ]
                 if not values:
                     continue
@@ -232,14 +226,11 @@ def normalised_performance(suite: Suite, study: Study, looks: Mapping[str, Look]
     return Plot(
         name=f"normalised_{suite.name}",
         title=f"{suite.title} performance by task demand",
-        caption=(
-            "Held-out return between the random reference (0) and the best agent (1), clipped. Bars: mean over the "
-            "environments of a demand group, given at the right. Symbols: single environments."
-        ),
+        caption="Held-out return between the random reference (0) and the best agent (1), clipped. Bars: mean over the "
+        "environments of a demand group, given at the right. Symbols: single environments.",
         alt=f"Bars of normalised performance for {len(agents)} agents in {len(demands)} demand groups.",
         data=rows(suite.normalised.groups),
         figure=figure,
-        group="demand",
     )
 
 
@@ -271,19 +262,16 @@ def worlds(study: Study, looks: Mapping[str, Look]) -> Plot | None:
     return Plot(
         name="worlds",
         title="Environments and their worlds",
-        caption=(
-            "Left: filled in unchanged environments, open in their worlds, mean over environments with 95 %"
-            " intervals. Right: best validation mean so far, solid in unchanged environments, dashed in worlds;"
-            " random actions count from the start. Bands: pointwise 95 % intervals over new worlds and runs; none"
-            " where there is one of each."
-        ),
+        caption="Left: filled in unchanged environments, open in their worlds, mean over environments with 95"
+        " % intervals. Right: best validation mean so far, solid in unchanged environments, dashed in worlds;"
+        " random actions count from the start. Bands: pointwise 95 % intervals over new worlds and runs; none"
+        " where there is one of each.",
         alt=f"Scores and learning curves of {len(entries)} entries in unchanged environments and in worlds.",
         data={
             "scores": rows(overall[entry] for entry in entries),
             "curves": {entry: rows(points) for entry, points in study.worlds.curves.items()},
         },
         figure=figure,
-        group="worlds",
     )
 
 

@@ -50,10 +50,8 @@ RC: dict[str, Any] = {
 def new_figure(
     width: float, height: float, *, names: Sequence[str] = (), **subplots: Any
 ) -> Iterator[tuple[Figure, Any]]:
-    """A figure of that size in inches with constrained layout, and its axes as `Figure.subplots` returns them.
-
-    With `names` the axes' rows have these names, from top to bottom.
-    """
+    """A figure of that size in inches with constrained layout, and its axes as `Figure.subplots` returns them. `names`:
+    of the axes' rows, from top to bottom."""
     with matplotlib.rc_context(RC):
         figure = Figure(figsize=(width, height), layout="constrained")
         FigureCanvasAgg(figure)

@@ -78,7 +78,6 @@ def timeline_of(env: str, runs: Iterable[Run], looks: Mapping[str, Look]) -> Plo
         alt=f"Timelines of {len(cut)} runs on {title_of(env)}: bands of synthesis and parametric edits with outcome marks.",
         data=data,
         svg=timeline_svg(lines),
-        group="timelines",
     )
 
 

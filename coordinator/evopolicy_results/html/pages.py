@@ -19,7 +19,7 @@ from evopolicy_results.figures.plot import Plot, inline_svg
 from evopolicy_results.figures.timelines import Row, timeline_svg
 from evopolicy_results.html import notice, section, visible
 from evopolicy_results.reading.agent_log import Evidence
-from evopolicy_results.reading.environments import title_of
+from evopolicy_results.reading.environments import grouped, title_of
 from evopolicy_results.reading.records import Run, Submit
 from evopolicy_results.scan.signals import TITLES
 from evopolicy_results.studies.palette import Look
@@ -142,7 +142,7 @@ def index_page(
         for table in tables
     }
     by_name = {figure.name: figure for figure in figures}
-    timelines = [figure for figure in figures if figure.group == "timelines"]
+    timelines = [figure for figure in figures if figure.name.startswith("timeline_")]
 
     def named(names: str) -> list[str]:
         return [
@@ -168,12 +168,9 @@ def index_page(
         links = [(f"{label} ({form})", f"tables/feedback_use.{suffix}") for form, suffix in FORMS]
         parts["feedback"] |= {"tables": [views["runs"]], "links": links}
     videos = "Videos of the selected checkpoints' episodes, agents side by side."
-    parts["replays"] = {
-        "texts": [videos]
-        if replay_links
-        else ["None of these runs has recorded episodes of its selected checkpoint."],
-        "links": [(title_of(env), href) for env, href in replay_links.items()],
-    }
+    none = "None of these runs has recorded episodes of its selected checkpoint."
+    links = [(title_of(env), href) for env, href in replay_links.items()]
+    parts["replays"] = {"texts": [videos if links else none], "links": links}
     nothing = "Nothing: every run folder that was found is in this report."
     parts["left-out"] = {"tables": [views["left_out"]]} if study.left_out else {"texts": [nothing]}
     first = ["returns", "evolution"]
@@ -214,41 +211,25 @@ def index_page(
 
 
 _NOTICES: tuple[tuple[Callable[[Run], bool], str], ...] = (
-    (
-        lambda run: not run.record.versions.data_secret,
-        "played public splits, of case files or a public seed: agents and models may know the hidden cases.",
-    ),
-    (
-        lambda run: bool(run.simulator_flags),
-        "have code that looks like a simulator, which their rules forbid: a signal to read, never a verdict.",
-    ),
-    (
-        lambda run: bool(run.signals),
-        "have signals in their log or code that deserve a look; none is a verdict.",
-    ),
-    (
-        lambda run: run.simulation_allowed,
-        "let their agent simulate, or are from before there was a rule against it.",
-    ),
+    (lambda run: not run.record.versions.data_secret,
+     "played public splits, of case files or a public seed: agents and models may know the hidden cases."),
+    (lambda run: bool(run.simulator_flags),
+     "have code that looks like a simulator, which their rules forbid: a signal to read, never a verdict."),
+    (lambda run: bool(run.signals), "have signals in their log or code that deserve a look; none is a verdict."),
+    (lambda run: run.simulation_allowed,
+     "let their agent simulate, or are from before there was a rule against it."),
     (lambda run: run.record.jail == "none", "had no jail around their agent."),
-    (
-        lambda run: run.record.hidden_isolation == "unknown",
-        "do not tell whether hidden episodes and agents shared a kernel: they are from before it was recorded.",
-    ),
-    (
-        lambda run: run.record.hidden_isolation == "shared",
-        "were played while hidden episodes and agents could share a kernel (--hidden-isolation off).",
-    ),
-    (
-        lambda run: run.record.hidden_isolation == "waived",
-        "had agents whose place the operator vouched for (--agent-host elsewhere).",
-    ),
-    (
-        lambda run: run.record.experiment_dimensions.hidden_cases == "per_run",
-        "had hidden cases of their own: no two scores are on the same cases, so differences between runs cannot be"
-        " paired by case.",
-    ),
-)
+    (lambda run: run.record.hidden_isolation == "unknown",
+     "do not tell whether hidden episodes and agents shared a kernel: they are from before it was recorded."),
+    (lambda run: run.record.hidden_isolation == "shared",
+     "were played while hidden episodes and agents could share a kernel (--hidden-isolation off)."),
+    (lambda run: run.record.hidden_isolation == "waived",
+     "had agents whose place the operator vouched for (--agent-host elsewhere)."),
+    (lambda run: run.record.experiment_dimensions.hidden_cases == "per_run",
+     "had hidden cases of their own: no two scores are on the same cases, so differences between runs cannot be"
+     " paired by case."),
+)  # fmt: skip
+"""Remarks on runs, each after the condition under which it holds of a run."""
 
 
 def _notices(study: Study) -> list[dict[str, Any]]:
@@ -256,7 +237,7 @@ def _notices(study: Study) -> list[dict[str, Any]]:
     if study.mixtures:
         title = "These runs are no fair comparison: they were mixed on purpose, and differ in"
         notices.append(notice(title, map(str, study.mixtures)))
-    counts = [(sum(map(concerns, study.runs)), text) for concerns, text in _NOTICES]
+    counts = [(sum(map(holds, study.runs)), text) for holds, text in _NOTICES]
     return notices + [notice(f"{n} of {len(study.runs)} runs {text}") for n, text in counts if n]
 
 
@@ -265,6 +246,8 @@ def table_view(table: Table, pages: Mapping[str, str] = {}) -> dict[str, Any]:
     columns = [
         c for c in table.columns if not table.rows or any(row.get(c.key) is not None for row in table.rows)
     ]
+    titles = [escape(visible(column.title)).replace(" /", Markup("&nbsp;/")) for column in columns]
+    runs = table.runs or [""] * len(table.rows)
     return {
         "id": table.name.replace("_", "-") + "-table",
         "title": table.title,
@@ -273,23 +256,15 @@ def table_view(table: Table, pages: Mapping[str, str] = {}) -> dict[str, Any]:
         "filter": len(table.rows) >= _FILTER_FROM,
         "folded": False,
         "columns": [
-            {
-                "title": escape(visible(column.title))
-                .replace(" /", Markup("&nbsp;/"))
-                .replace("-", "\u2011"),
-                "numeric": column.kind != "text",
-                "note": column.note,
-            }
-            for column in columns
+            {"title": title.replace("-", "\u2011"), "numeric": column.kind != "text", "note": column.note}
+            for column, title in zip(columns, titles, strict=True)
         ],
         "rows": [
             [
                 _cell(column, row.get(column.key), table.marks.get((number, column.key), 0), pages.get(run))
                 for column in columns
             ]
-            for number, (row, run) in enumerate(
-                zip(table.rows, table.runs or [""] * len(table.rows), strict=True)
-            )
+            for number, (row, run) in enumerate(zip(table.rows, runs, strict=True))
         ],
     }
 
@@ -408,11 +383,14 @@ class PlayedEpisode(NamedTuple):
 
 def replays_page(env: str, episodes: Iterable[PlayedEpisode], looks: Mapping[str, Look]) -> str:
     """One environment's recordings: one group per case, with one card per run."""
-    groups: dict[str, list[PlayedEpisode]] = {}
-    for played in sorted(
-        episodes,
-        key=lambda p: (p.replay.split, p.replay.episode, p.run.entry.casefold(), p.run.record.repeat),
-    ):
+
+    def case(played: PlayedEpisode) -> str:
         split = "Held-out" if played.replay.split == "heldout" else played.replay.split.capitalize()
-        groups.setdefault(f"{split} case {played.replay.episode}", []).append(played)
+        return f"{split} case {played.replay.episode}"
+
+    def place(played: PlayedEpisode) -> tuple[str, int, str, int]:
+        replay, run = played.replay, played.run
+        return replay.split, replay.episode, run.entry.casefold(), run.record.repeat
+
+    groups = grouped(sorted(episodes, key=place), case)
     return page("replays", title=f"Replays: {title_of(env)}", env=env, looks=looks, groups=groups)

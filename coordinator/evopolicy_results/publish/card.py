@@ -27,8 +27,8 @@ from evopolicy_common.records.journal import Result
 from evopolicy_common.records.run_record import RunRecord
 from evopolicy_common.records.summary import utc_text
 from evopolicy_results.publish import contents
+from evopolicy_results.scoring import scores
 from evopolicy_results.statistics.pairs import cell_mean
-from evopolicy_results.statistics.samples import RunReturns, Sample
 
 VERSION = 1
 _TOLERANCE = 0.05
@@ -203,8 +203,8 @@ def _cell(env: str, entry: str, sources: Sequence[Source]) -> Cell:
         is_shared = record.experiment_dimensions.hidden_cases == "shared"
         cases, score = record.versions.cases_hash("heldout") if is_shared else "", record.outcome.score
         returns = result.heldout_returns if score is not None else ()
-        runs.append(RunReturns(score=score, returns=returns, case_set=cases))
-    estimate = cell_mean(Sample(entry=entry, env=env, runs=tuple(runs)))
+        runs.append(scores.RunReturns(score=score, returns=returns, case_set=cases))
+    estimate = cell_mean(scores.Cell(entry=entry, env=env, runs=tuple(runs)))
     outcomes = [each.record.outcome for each in sources]
     scores = [each.score for each in outcomes if each.score is not None]
     random = [each.random_score for each in outcomes if each.random_score is not None]

@@ -9,12 +9,14 @@ the only ones it plays; without it the lowest first score of any run), 1 the bes
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from itertools import zip_longest
 
 import msgspec
 
 from evopolicy_results.behaviour.edits import classify
-from evopolicy_results.reading.environments import ordered_environments
+from evopolicy_results.reading.environments import grouped, ordered_environments
 from evopolicy_results.reading.records import Run
+from evopolicy_results.scoring.scores import Scale, scale_between
 
 
 class CurvePoint(msgspec.Struct, frozen=True, kw_only=True):
@@ -48,73 +50,57 @@ class Evolution(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def evolutions(runs: Iterable[Run], references: Mapping[str, float]) -> list[Evolution]:
-    """Every run's curve, environments in catalogue order, then by entry and run.
-
-    `references`: by environment, the mean return of the random reference, if known.
-    """
-    by_env: dict[str, list[Run]] = {}
-    for run in runs:
-        by_env.setdefault(run.env, []).append(run)
+    """Every run's curve, environments in catalogue order, then by entry and run. `references`: by environment, the mean
+    return of the random reference, if known."""
+    by_env = grouped(runs, lambda run: run.env)
     out: list[Evolution] = []
     for env in ordered_environments(by_env):
         group = sorted(by_env[env], key=lambda run: (run.entry.casefold(), run.name))
-        curves = [
-            tuple(
-                CurvePoint(
-                    index=t.index, consumed=t.consumed, val_mean=t.val_mean, best=t.best, improved=t.hit
-                )
-                for t in classify(run.submits)
+        curves = [_curve(run) for run in group]
+        scored = [steps for steps in curves if steps]
+        first = min((steps[0].val_mean for steps in scored), default=None)
+        top = max((steps[-1].best for steps in scored), default=None)
+        scale = scale_between(references.get(env, first), top)
+        out += [
+            Evolution(
+                run=run.name,
+                entry=run.entry,
+                env=env,
+                budget=run.budget,
+                steps=steps,
+                n_improvements=sum(step.improved for step in steps[1:]),
+                area=area(steps, run.budget, scale),
+                to_50=episodes_to(steps, 0.5, scale),
+                to_80=episodes_to(steps, 0.8, scale),
             )
-            for run in group
+            for run, steps in zip(group, curves, strict=True)
         ]
-        base, top = scale(curves, references.get(env))
-        for run, steps in zip(group, curves, strict=True):
-            out.append(
-                Evolution(
-                    run=run.name,
-                    entry=run.entry,
-                    env=env,
-                    budget=run.budget,
-                    steps=steps,
-                    n_improvements=sum(step.improved for step in steps[1:]),
-                    area=area(steps, run.budget, base, top),
-                    to_50=episodes_to(steps, 0.5, base, top),
-                    to_80=episodes_to(steps, 0.8, base, top),
-                )
-            )
     return out
 
 
-def scale(
-    curves: Iterable[Sequence[CurvePoint]], reference: float | None
-) -> tuple[float | None, float | None]:
-    """The returns at 0 and 1 of the environment's scale; both None when no run has a score."""
-    scored = [steps for steps in curves if steps]
-    if not scored:
-        return None, None
-    base = min(steps[0].val_mean for steps in scored) if reference is None else reference
-    return base, max(steps[-1].best for steps in scored)
+def _curve(run: Run) -> tuple[CurvePoint, ...]:
+    return tuple(
+        CurvePoint(index=t.index, consumed=t.consumed, val_mean=t.val_mean, best=t.best, improved=t.hit)
+        for t in classify(run.submits)
+    )
 
 
-def area(steps: Sequence[CurvePoint], budget: int, base: float | None, top: float | None) -> float | None:
+def area(steps: Sequence[CurvePoint], budget: int, scale: Scale | None) -> float | None:
     """Time-averaged normalised best score: the integral over episodes 0 … budget, divided by the budget."""
-    if base is None or top is None or top <= base or budget <= 0:
+    if scale is None or budget <= 0:
         return None
     total = 0.0
-    for i, step in enumerate(steps):
-        until = steps[i + 1].consumed if i + 1 < len(steps) else budget
-        level = min(1.0, max(0.0, (step.best - base) / (top - base)))
-        total += level * max(0, until - step.consumed)
+    for step, after in zip_longest(steps, steps[1:]):
+        until = budget if after is None else after.consumed
+        total += scale.clipped(step.best) * max(0, until - step.consumed)
     return total / budget
 
 
-def episodes_to(
-    steps: Sequence[CurvePoint], share: float, base: float | None, top: float | None
-) -> int | None:
-    """Episodes consumed when the best score first reaches `base + share · (top − base)`; None if it never does."""
-    if base is None or top is None or top <= base:
+def episodes_to(steps: Sequence[CurvePoint], share: float, scale: Scale | None) -> int | None:
+    """Episodes consumed when the best score first reaches `share` of the scale; None if it never does."""
+    if scale is None:
         return None
-    goal = base + share * (top - base)
+    goal = scale.random + share * (scale.best - scale.random)
     return next((step.consumed for step in steps if step.best >= goal), None)
 
 

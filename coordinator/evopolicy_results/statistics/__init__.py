@@ -6,7 +6,6 @@
     for pair in core16.pairs:                    # typed records
         print(pair.env, pair.first, pair.second, pair.gap, pair.p_holm, pair.verdict)
 
-Pure: arrays in, records out, seeded. `samples` is the input; `pairs`, `standings`, `resolution`, `aggregates`
-and `generalisation` hold a report's results. Only runs that the report compares are used, so unfair mixtures occur only
-if the operator allowed them.
+Pure: cells of `scoring` in, records out, seeded. Only runs that the report compares are used, so unfair mixtures occur
+only if the operator allowed them.
 """

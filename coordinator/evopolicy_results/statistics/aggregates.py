@@ -20,8 +20,8 @@ import numpy as np
 from evopolicy_common.statistics.distributions import ALPHA
 from evopolicy_common.statistics.intervals import no_spread
 from evopolicy_common.statistics.resampling import RESAMPLES, Floats, weights
-from evopolicy_results.scoring.normalised import Scale
-from evopolicy_results.statistics.samples import Sample, matched
+from evopolicy_results.scoring.scores import Cell, Scale
+from evopolicy_results.statistics.pairs import returns_in
 
 LEAST_RUNS = 5
 NO_SCALE = "no scale: agents do not clearly beat random"
@@ -55,8 +55,7 @@ class Aggregate(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Improvement(msgspec.Struct, frozen=True, kw_only=True):
-    """Probability that a run of the first entry beats one of the second; mean over the environments that both have
-    played."""
+    """Probability that a run of the first entry beats one of the second; mean over the environments of both."""
 
     first: str
     second: str
@@ -100,25 +99,20 @@ class _Cell(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def aggregates(
-    samples: Mapping[tuple[str, str], Sample],
+    samples: Mapping[tuple[str, str], Cell],
     agents: Sequence[str],
     scales: Mapping[str, Scale],
     *,
     resamples: int = RESAMPLES,
 ) -> tuple[list[Aggregate], list[Improvement]]:
     """Aggregates of all agents, and improvements of each pair; environments without a scale are left out."""
-    cells: dict[tuple[str, str], _Cell] = {}
+    by_entry: dict[str, dict[str, _Cell]] = {agent: {} for agent in agents}
     for place, (env, scale) in enumerate(scales.items()):
         here = [sample for (_, e), sample in samples.items() if e == env]
-        drawn = {
-            sample.entry: _drawn(sample, (place, number), resamples) for number, sample in enumerate(here)
-        }
+        drawn = {one.entry: _drawn(one, (place, number), resamples) for number, one in enumerate(here)}
         low, width = _drawn_scale(here, drawn, scale)
-        for agent in drawn.keys() & set(agents):
-            cells[agent, env] = _normalised(drawn[agent], scale, low, width)
-    by_entry = {
-        agent: {env: cells[agent, env] for env in scales if (agent, env) in cells} for agent in agents
-    }
+        for agent in drawn.keys() & by_entry.keys():
+            by_entry[agent][env] = _normalised(drawn[agent], scale, low, width)
     alone = [_aggregate(agent, list(own.values())) for agent, own in by_entry.items() if own]
     against = [
         _improvement(one, other, [(by_entry[one][env], by_entry[other][env]) for env in common])
@@ -128,15 +122,13 @@ def aggregates(
     return alone, against
 
 
-def _drawn(sample: Sample, seed: tuple[int, int], resamples: int) -> _Cell:
+def _drawn(sample: Cell, seed: tuple[int, int], resamples: int) -> _Cell:
     """Resamples of runs about the mean of resampled cases."""
     scores = np.array([-np.inf if run.score is None else run.score for run in sample.runs], dtype=np.float64)
-    n = len(scores)
-    common = matched([sample])
-    shift = np.zeros((resamples, 1))
-    if common is not None and (n_cases := common.returns[0].shape[1]) > 1:
+    n, known, shift = len(scores), returns_in(sample), np.zeros((resamples, 1))
+    if known is not None and (n_cases := known.shape[1]) > 1:
         # All entries share the draws of cases, as they share the cases.
-        by_case = common.returns[0].mean(axis=0)
+        by_case = known.mean(axis=0)
         drawn = weights(n_cases, n_cases, resamples, seed[0]) @ (by_case - by_case.mean()) / n_cases
         shift = drawn[:, None]
     elif n == 1 and np.isfinite(scores[0]):
@@ -147,32 +139,31 @@ def _drawn(sample: Sample, seed: tuple[int, int], resamples: int) -> _Cell:
     if np.isfinite(scores).all():
         middle = scores.mean() + shift
         stretched = middle + np.sqrt(n / (n - 1)) * (returns - middle)
-    over = "runs" if common is None else "runs and cases"
+    over = "runs" if known is None else "runs and cases"
     return _Cell(scores=scores, returns=returns, stretched=stretched, over=over)
 
 
-def _drawn_scale(here: Sequence[Sample], cells: Mapping[str, _Cell], scale: Scale) -> tuple[Floats, Floats]:
+def _drawn_scale(here: Sequence[Cell], cells: Mapping[str, _Cell], scale: Scale) -> tuple[Floats, Floats]:
     """Resampled low end and width of a scale, (resamples, 1). The best agent stays the observed one, and an end that
     cannot be resampled stays fixed. A width that is not above 0 becomes 0."""
     ends = {False: np.array([[scale.best]]), True: np.array([[scale.random]])}
     for sample in here:
-        known, end = sample.scores, scale.random if sample.is_fixed else scale.best
+        is_fixed = sample.fixed is not None
+        known, end = sample.scores, scale.random if is_fixed else scale.best
         drawn = cells[sample.entry].stretched
         if drawn is not None and known is not None and np.isclose(np.mean(known), end, rtol=1e-12, atol=0.0):
-            ends[sample.is_fixed] = drawn.mean(axis=1, keepdims=True)
+            ends[is_fixed] = drawn.mean(axis=1, keepdims=True)
     return ends[True], np.maximum(0.0, ends[False] - ends[True])
 
 
 def _normalised(cell: _Cell, scale: Scale, low: Floats, width: Floats) -> _Cell:
     def normalised(drawn: Floats | None) -> Floats | None:
+        if drawn is None:
+            return None
         # Without a width, a resample's scores are infinite: the interval of an aggregate that rests on them has no
         # bounds.
         with np.errstate(divide="ignore", invalid="ignore"):
-            return (
-                None
-                if drawn is None
-                else np.nan_to_num((drawn - low) / width, nan=0.0, posinf=np.inf, neginf=-np.inf)
-            )
+            return np.nan_to_num((drawn - low) / width, nan=0.0, posinf=np.inf, neginf=-np.inf)
 
     returns = None if 1 < len(cell.scores) < LEAST_RUNS else cell.returns
     return _Cell(
@@ -186,19 +177,18 @@ def _normalised(cell: _Cell, scale: Scale, low: Floats, width: Floats) -> _Cell:
 
 def _aggregate(entry: str, cells: Sequence[_Cell]) -> Aggregate:
     scores = np.concatenate([cell.scores for cell in cells])
+    n, middle = len(scores), float(iqm(scores))
     drawn = _together([cell.stretched for cell in cells])
     counted = _together([cell.counted for cell in cells])
-    middle = float(iqm(scores))
+    shares = [None] * len(TAUS) if counted is None else list(profile(counted).T)
     drawn_middle = None if drawn is None else iqm(drawn)
-    drawn_shares = [None] * len(TAUS) if counted is None else list(profile(counted).T)
     return Aggregate(
         entry=entry,
-        iqm=_bounded(middle, drawn_middle, len(scores)) if np.isfinite(middle) else None,
+        iqm=_bounded(middle, drawn_middle, n) if np.isfinite(middle) else None,
         profile=tuple(
-            _bounded(float(share), resampled, len(scores))
-            for share, resampled in zip(profile(scores), drawn_shares, strict=True)
+            _bounded(float(share), one, n) for share, one in zip(profile(scores), shares, strict=True)
         ),
-        n_runs=len(scores),
+        n_runs=n,
         n_environments=len(cells),
         over="nothing" if drawn is None else " or ".join(sorted({cell.over for cell in cells})),
     )

@@ -16,7 +16,7 @@ import msgspec
 from evopolicy_common.statistics.intervals import Estimate, of_runs
 from evopolicy_results.reading.environments import family_of
 from evopolicy_results.reading.records import Run, by_cell
-from evopolicy_results.scoring.normalised import Scale
+from evopolicy_results.scoring.scores import Scale, mean_of_all
 
 SUCCESS_ABOVE = {"minigrid": 0.0, "gym/acrobot": -500.0, "gym/continuouscar": 0.0}
 """By family or environment, the return above which an episode has reached its goal. MiniGrid pays 1 − 0.9 ·
@@ -39,8 +39,7 @@ class Generalisation(msgspec.Struct, frozen=True, kw_only=True):
     normalised_optimism: float | None
     """As a share of the random-to-best scale."""
     success: float | None
-    """Share of held-out episodes that reached the goal, as the environment reports it, or else as its returns determine
-    it; None if neither does."""
+    """Share of held-out episodes that reached the goal, as environment or returns tell it; None if neither does."""
 
 
 def generalisation(runs: Iterable[Run], scales: Mapping[str, Scale]) -> list[Generalisation]:
@@ -50,36 +49,30 @@ def generalisation(runs: Iterable[Run], scales: Mapping[str, Scale]) -> list[Gen
 
 
 def optimism(entries: Iterable[str], cells: Sequence[Generalisation]) -> dict[str, Estimate]:
-    """By entry, the mean of its normalised optimism with a t interval over environments; without entries that have
-    none."""
-    known = {entry: [cell.normalised_optimism for cell in cells if cell.entry == entry] for entry in entries}
-    values = {entry: [value for value in several if value is not None] for entry, several in known.items()}
+    """The mean normalised optimism of each entry that has any, with a t interval over environments."""
+    known = [(cell.entry, cell.normalised_optimism) for cell in cells]
+    values = {entry: [value for e, value in known if e == entry and value is not None] for entry in entries}
     return {entry: of_runs(several) for entry, several in values.items() if several}
 
 
 def _cell(entry: str, env: str, runs: Sequence[Run], scale: Scale | None) -> Generalisation:
     heldout = fmean(run.score for run in runs if run.score is not None)
-    train = mean_of_all([run.selected.mean_return if run.selected is not None else None for run in runs])
-    validation = mean_of_all([run.selected.val_mean if run.selected is not None else None for run in runs])
+    selected = [run.selected for run in runs]
+    validation = mean_of_all([None if each is None else each.val_mean for each in selected])
     optimism = None if validation is None else validation - heldout
-    width = None if scale is None else scale.best - scale.random
     return Generalisation(
         entry=entry,
         env=env,
         n_runs=len(runs),
-        train=train,
+        train=mean_of_all([None if each is None else each.mean_return for each in selected]),
         validation=validation,
         heldout=heldout,
         optimism=optimism,
-        normalised_optimism=None if optimism is None or width is None else optimism / width,
+        normalised_optimism=None
+        if optimism is None or scale is None
+        else optimism / (scale.best - scale.random),
         success=_success(env, runs),
     )
-
-
-def mean_of_all(values: Sequence[float | None]) -> float | None:
-    """None unless all are known."""
-    known = [value for value in values if value is not None]
-    return fmean(known) if known and len(known) == len(values) else None
 
 
 def _success(env: str, runs: Sequence[Run]) -> float | None:

@@ -1,4 +1,5 @@
-"""Each pair of entries on every environment: gap, interval, p value, and Holm's correction over all pairs of the suite.
+"""Each pair of entries on every environment: gap, interval, p value, and Holm's correction over all pairs of the suite;
+the smallest gap that an experiment resolves at 95 %, and the number of repeats that a given gap would need.
 
 The verdict rests on the interval's own distribution, so it never contradicts the interval: the uncorrected p is at most
 0.05 exactly if the interval excludes 0, and the corrected p is no smaller.
@@ -6,9 +7,11 @@ The verdict rests on the interval's own distribution, so it never contradicts th
 
 from __future__ import annotations
 
+import bisect
 import itertools
 import math
 from collections.abc import Mapping, Sequence
+from statistics import fmean, median
 from typing import Literal
 
 import msgspec
@@ -16,11 +19,10 @@ import numpy as np
 from msgspec.structs import replace
 
 from evopolicy_common.statistics import intervals
-from evopolicy_common.statistics.distributions import ALPHA, holm, normal_quantile
-from evopolicy_common.statistics.intervals import Estimate, difference, of_runs
+from evopolicy_common.statistics.distributions import ALPHA, holm, normal_quantile, t_two_sided
+from evopolicy_common.statistics.intervals import Estimate, components, difference, of_runs
 from evopolicy_common.statistics.resampling import RESAMPLES, Floats, label_patterns
-from evopolicy_results.statistics.repeats import repeats_needed, spread_of
-from evopolicy_results.statistics.samples import Matched, Sample, matched
+from evopolicy_results.scoring.scores import Cell, Scale
 
 Verdict = Literal["first", "second", "not told apart", "not comparable"]
 
@@ -28,7 +30,7 @@ NO_COMMON_CASES = "no common cases"
 NO_RETURNS = "returns by case are not known"
 NO_SCORE = "a run has no ok submit"
 MAX_CASES = 100_000
-_CHUNK = 20_000
+MAX_REPEATS = 1000
 _CLOSE = 1e-9
 """Relative tolerance: statistics that differ only by rounding count as equal."""
 
@@ -53,8 +55,7 @@ class Pair(msgspec.Struct, frozen=True, kw_only=True):
     p_holm: float | None = None
     """Corrected over all pairs of the suite, those with the random reference included."""
     p_these_cases: float | None
-    """p value of an exchange of runs, which takes these cases as given; None unless both have several runs. No verdict
-    rests on it."""
+    """p value of an exchange of runs on these given cases; None unless both have several runs. No verdict uses it."""
     verdict: Verdict = "not comparable"
     """The better entry by the corrected p at 5 %."""
     n_needed: int | None = None
@@ -65,8 +66,44 @@ class Pair(msgspec.Struct, frozen=True, kw_only=True):
     """Why there is no interval; empty otherwise."""
 
 
+class Matched(msgspec.Struct, frozen=True, kw_only=True):
+    """Cells on the cases that all their runs have."""
+
+    returns: tuple[Floats, ...]
+    """One matrix runs × cases per cell."""
+    n_left_out: int
+    """Number of cases that only some of the runs have."""
+
+
+def matched(cells: Sequence[Cell]) -> Matched | None:
+    """The cells' returns on their common cases; None if no case is common to all runs."""
+    runs = [run for cell in cells for run in cell.runs]
+    if not runs or any(not run.returns or run.score is None for run in runs):
+        return None
+    if len(runs) > 1 and (len({run.case_set for run in runs}) > 1 or not runs[0].case_set):
+        return None
+    every = np.full((len(runs), max(len(run.returns) for run in runs)), np.nan)
+    for row, run in zip(every, runs, strict=True):
+        row[: len(run.returns)] = run.returns
+    has = np.isfinite(every)
+    common = has.all(axis=0)
+    if not common.any():
+        return None
+    ends = np.cumsum([len(cell.runs) for cell in cells])
+    return Matched(
+        returns=tuple(np.split(every[:, common], ends[:-1])),
+        n_left_out=int(has.any(axis=0).sum() - common.sum()),
+    )
+
+
+def returns_in(cell: Cell) -> Floats | None:
+    """A matrix runs × cases, of the cases that all of the cell's runs have; None if there are none."""
+    common = matched([cell])
+    return None if common is None else common.returns[0]
+
+
 def pairs(
-    samples: Mapping[tuple[str, str], Sample],
+    samples: Mapping[tuple[str, str], Cell],
     entries: Sequence[str],
     environments: Sequence[str],
     *,
@@ -84,29 +121,28 @@ def pairs(
     return [_decided(pair, common, p, n_open) for (pair, common), p in zip(compared, corrected, strict=True)]
 
 
-def _compared(first: Sample, second: Sample, resamples: int) -> tuple[Pair, Matched | None]:
+def _compared(first: Cell, second: Cell, resamples: int) -> tuple[Pair, Matched | None]:
     """The pair without its correction for all others, and the returns on the common cases."""
-    gap, common = None, None
+    gap, common, p_these_cases = None, None, None
+    several, is_fixed = (len(first.runs) > 1, len(second.runs) > 1), second.fixed is not None
     if first.scores is not None and second.scores is not None:
         common = matched((first, second))
         if common is not None:
-            gap = difference(*common.returns, resamples=resamples, fixed=second.is_fixed)
-        elif len(first.runs) > 1 and len(second.runs) > 1:
+            gap = difference(*common.returns, resamples=resamples, fixed=is_fixed)
+            if all(several):
+                p_these_cases = label_test(*(matrix.mean(axis=1).tolist() for matrix in common.returns))
+        elif all(several):
             gap = of_runs(first.scores, second.scores)
         else:
             known = all(run.returns for run in (*first.runs, *second.runs))
             value = float(np.mean(first.scores) - np.mean(second.scores))
             gap = Estimate(value=value, reason=NO_COMMON_CASES if known else NO_RETURNS)
-    p_these_cases = None
-    if common is not None and min(map(len, common.returns)) > 1:
-        p_these_cases = label_test(*(matrix.mean(axis=1).tolist() for matrix in common.returns))
-    of_agents = len(first.runs) > 1 and (len(second.runs) > 1 or second.is_fixed)
     pair = Pair(
         env=first.env,
         first=first.entry,
         second=second.entry,
         gap=gap,
-        compares="agents" if of_agents else "checkpoints",
+        compares="agents" if several[0] and (several[1] or is_fixed) else "checkpoints",
         n_runs=(len(first.runs), len(second.runs)),
         n_cases=0 if common is None else common.returns[0].shape[1],
         n_left_out=0 if common is None else common.n_left_out,
@@ -125,21 +161,17 @@ def label_test(first: Sequence[float], second: Sequence[float], n_random: int = 
     are not reported as different when there are many runs (Janssen 1997). All patterns are tried if they are few,
     otherwise a random sample plus the observed pattern.
     """
-    n_first, n_second = len(first), len(second)
+    sizes = len(first), len(second)
     pooled = np.array([*first, *second])
     pooled = pooled - pooled.mean()
-    patterns, exact = label_patterns(n_first, n_second, n_random)
-    own = np.repeat([[1.0, 0.0]], [n_first, n_second], axis=1)
-    observed = float(_welch(own, pooled, n_first, n_second)[0])
-    reached = 0
-    for start in range(0, len(patterns), _CHUNK):
-        t = _welch(patterns[start : start + _CHUNK], pooled, n_first, n_second)
-        reached += int((t >= observed * (1.0 - _CLOSE)).sum())
+    patterns, exact = label_patterns(*sizes, n_random)
+    observed = float(_welch(np.repeat([[1.0, 0.0]], sizes, axis=1), pooled, *sizes)[0])
+    reached = int((_welch(patterns, pooled, *sizes) >= observed * (1.0 - _CLOSE)).sum())
     return reached / len(patterns) if exact else (reached + 1.0) / (len(patterns) + 1.0)
 
 
 def _welch(labels: Floats, pooled: Floats, n_first: int, n_second: int) -> Floats:
-    """t| of each pattern: 0 without spread and difference, infinite for a difference without spread."""
+    """The absolute t of each pattern: 0 without spread and difference, infinite for a difference without spread."""
     scale = float(np.abs(pooled).max(initial=0.0))
     if scale == 0.0:
         return np.zeros(len(labels))
@@ -156,37 +188,177 @@ def _welch(labels: Floats, pooled: Floats, n_first: int, n_second: int) -> Float
 
 
 def _decided(pair: Pair, common: Matched | None, p_holm: float | None, n_open: int) -> Pair:
+    """`n_open`: pairs of the suite that are not told apart, whose smallest p must be at most 5 % over their number."""
     if pair.gap is None or p_holm is None:
         return pair
     if p_holm <= ALPHA:
         return replace(pair, p_holm=p_holm, verdict="first" if pair.gap.value > 0.0 else "second")
-    n_needed = None if common is None or pair.gap.value == 0.0 else _needed(pair, common, n_open)
+    n_needed = None if common is None else _needed(pair, pair.gap, common, ALPHA / n_open)
     return replace(pair, p_holm=p_holm, verdict="not told apart", n_needed=n_needed)
 
 
-def _needed(pair: Pair, common: Matched, n_open: int) -> int | None:
-    """`n_open`: pairs of the suite that are not told apart; the smallest p of them must be at most 5 % over their
-    number."""
-    assert pair.gap is not None
-    assert pair.p is not None
-    level = ALPHA / n_open
-    if pair.compares == "agents":
-        n = repeats_needed(spread_of(*common.returns), abs(pair.gap.value), level=level)
-        return n and max(n, 1 + max(len(matrix) for matrix in common.returns if len(matrix) > 1))
-    if pair.p >= 1.0 - 1e-9:
+def _needed(pair: Pair, gap: Estimate, common: Matched, level: float) -> int | None:
+    if gap.value == 0.0:
         return None
-    factor = normal_quantile(1.0 - level / 2.0) / normal_quantile(1.0 - pair.p / 2.0)
+    if pair.compares == "agents":
+        n = repeats_needed(spread_of(*common.returns), abs(gap.value), level=level)
+        return n and max(n, 1 + max(len(matrix) for matrix in common.returns if len(matrix) > 1))
+    if gap.p is None or gap.p >= 1.0 - 1e-9:
+        return None
+    factor = normal_quantile(1.0 - level / 2.0) / normal_quantile(1.0 - gap.p / 2.0)
     n_cases = math.ceil(pair.n_cases * factor**2)
     return n_cases if n_cases <= MAX_CASES else None
 
 
-def cell_mean(sample: Sample, *, resamples: int = RESAMPLES) -> Estimate | None:
+class Spread(msgspec.Struct, frozen=True, kw_only=True):
+    """Variances of a difference between two agents on one environment, mean over both, or over all pairs."""
+
+    run: float
+    """Variance between runs of one agent, of their held-out means."""
+    case: float
+    """Variance of the difference that more runs do not reduce: agents differ by case, and these cases are a sample.
+    An estimate, which may be below 0."""
+    n_cases: int
+
+
+def spread_of(*returns: Floats) -> Spread:
+    """Variances of two agents, from matrices runs × the same cases. A matrix of one row is one fixed policy."""
+    parts = [components(matrix) for matrix in returns]
+    gaps = components((returns[0].mean(axis=0) - returns[1].mean(axis=0))[None, :])
+    return Spread(
+        run=sum(part.runs * part.n_runs for part in parts) / 2.0,
+        case=gaps.cases - sum(part.residual for part in parts),
+        n_cases=gaps.n_cases,
+    )
+
+
+def repeats_needed(spread: Spread, gap: float, *, level: float = ALPHA) -> int | None:
+    """The fewest runs per agent, from 2, whose interval of a difference, at 1 − `level`, is no wider than ± `gap`. A
+    true gap of that size is then distinguished from 0 in half of all experiments. None if no number up to
+    `MAX_REPEATS` does: the gap needs more cases. Raises ValueError for a gap that is not above 0."""
+    if not gap > 0.0:
+        raise ValueError(f"a gap of {gap} cannot be resolved; give one above 0")
+
+    def resolves(n: int) -> bool:
+        error, df = standard_error(spread, n)
+        return error <= 0.0 or t_two_sided(gap / error, df) <= level
+
+    n = 2 + bisect.bisect_left(range(2, MAX_REPEATS + 1), True, key=resolves)
+    return n if n <= MAX_REPEATS else None
+
+
+def standard_error(spread: Spread, n: int) -> tuple[float, float]:
+    """Standard error of a difference between two agents of n ≥ 2 runs each, and its degrees of freedom."""
+    by_run, by_case = 2.0 * spread.run / n, max(0.0, spread.case)
+    total = by_run + by_case
+    if total <= 0.0:
+        return 0.0, math.inf
+    below = (by_run / total) ** 2 / (2.0 * (n - 1))
+    below += (by_case / total) ** 2 / (spread.n_cases - 1) if spread.n_cases > 1 else 0.0
+    return math.sqrt(total), round(1.0 / below, 3) if below > 0.0 else math.inf
+
+
+def cell_mean(cell: Cell, *, resamples: int = RESAMPLES) -> Estimate | None:
     """An entry's held-out mean on one environment; None if a run has no ok submit."""
-    if sample.scores is None:
+    if cell.scores is None:
         return None
-    common = matched([sample])
-    if common is not None:
-        return intervals.mean(common.returns[0], resamples=resamples)
-    if len(sample.runs) == 1:
-        return Estimate(value=sample.scores[0], reason=NO_RETURNS)
-    return of_runs(sample.scores)
+    if (returns := returns_in(cell)) is not None:
+        return intervals.mean(returns, resamples=resamples)
+    if len(cell.runs) == 1:
+        return Estimate(value=cell.scores[0], reason=NO_RETURNS)
+    return of_runs(cell.scores)
+
+
+GAPS = (0.05, 0.1, 0.2)
+"""Gaps on the random-to-best scale for which a report gives the repeats."""
+
+
+class Resolution(msgspec.Struct, frozen=True, kw_only=True):
+    """The gap that one environment can resolve between agents."""
+
+    env: str
+    gap: float | None
+    """Half width of the 95 % intervals of the differences, median over the pairs of agents, in returns."""
+    scale: float | None
+    """Best agent's mean minus the random reference's, in returns; None without such a scale."""
+    n_cases: int
+    n_runs: tuple[int, int]
+    """Fewest and most runs of an agent."""
+    spread: Spread | None
+    """None unless every agent has two or more runs on the same cases: one run does not show how runs vary."""
+
+    @property
+    def normalised_gap(self) -> float | None:
+        """`gap` as a share of the scale."""
+        return None if self.gap is None or self.scale is None else self.gap / self.scale
+
+    def repeats(self, share: float) -> int | Literal["more cases"] | None:
+        """Runs per agent that resolve a gap of `share` of the scale, or that no number does; None if unknown."""
+        if self.spread is None or self.scale is None:
+            return None
+        return repeats_needed(self.spread, share * self.scale) or "more cases"
+
+
+def resolutions(
+    samples: Mapping[tuple[str, str], Cell],
+    compared: Sequence[Pair],
+    agents: Sequence[str],
+    scales: Mapping[str, Scale],
+    environments: Sequence[str],
+) -> list[Resolution]:
+    """One for each environment that two or more agents have played."""
+    out: list[Resolution] = []
+    for env in environments:
+        here = [samples[agent, env] for agent in agents if (agent, env) in samples]
+        if len(here) < 2:
+            continue
+        own = [pair for pair in compared if pair.env == env and {pair.first, pair.second} <= set(agents)]
+        gaps = [pair.gap for pair in own if pair.gap is not None]
+        halves = [0.5 * (g.high - g.low) for g in gaps if g.low is not None and g.high is not None]
+        n_runs = [len(sample.runs) for sample in here]
+        out.append(
+            Resolution(
+                env=env,
+                gap=median(halves) if halves else None,
+                scale=scales[env].best - scales[env].random if env in scales else None,
+                n_cases=max((pair.n_cases for pair in own), default=0),
+                n_runs=(min(n_runs), max(n_runs)),
+                spread=_spread(here),
+            )
+        )
+    return out
+
+
+def overall(resolved: Sequence[Resolution]) -> Resolution | None:
+    """Resolution of the mean of normalised scores over environments, on which the scale is 1; None unless each
+    environment has a scale and a gap. Environments are fixed: the suite is not a sample."""
+    n = len(resolved)
+    known = [gap for one in resolved if (gap := one.normalised_gap) is not None]
+    if not known or len(known) < n:
+        return None
+    spreads = [(one.spread, one.scale**2) for one in resolved if one.spread and one.scale]
+    spread = Spread(
+        run=sum(one.run / square for one, square in spreads) / n**2,
+        case=sum(one.case / square for one, square in spreads) / n**2,
+        n_cases=sum(one.n_cases for one, _ in spreads),
+    )
+    return Resolution(
+        env="",
+        gap=math.sqrt(sum(gap**2 for gap in known)) / n,
+        scale=1.0,
+        n_cases=sum(one.n_cases for one in resolved),
+        n_runs=(min(one.n_runs[0] for one in resolved), max(one.n_runs[1] for one in resolved)),
+        spread=spread if len(spreads) == n else None,
+    )
+
+
+def _spread(samples: Sequence[Cell]) -> Spread | None:
+    common = matched(samples)
+    if common is None or any(len(matrix) < 2 for matrix in common.returns):
+        return None
+    spreads = [spread_of(one, other) for one, other in itertools.combinations(common.returns, 2)]
+    return Spread(
+        run=fmean(one.run for one in spreads),
+        case=fmean(one.case for one in spreads),
+        n_cases=spreads[0].n_cases,
+    )

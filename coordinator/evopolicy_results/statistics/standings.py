@@ -23,9 +23,10 @@ import numpy as np
 from evopolicy_common.statistics.distributions import ALPHA, holm
 from evopolicy_common.statistics.resampling import RESAMPLES, Floats, t_weights
 from evopolicy_results.reading.environments import by_name
-from evopolicy_results.statistics.pairs import Pair
-from evopolicy_results.statistics.samples import Sample, matched
+from evopolicy_results.scoring.scores import Cell
+from evopolicy_results.statistics.pairs import Pair, returns_in
 
+_BOUNDS = (ALPHA / 2.0, 1.0 - ALPHA / 2.0)
 MAX_GROUPS = 200
 """Above this number of tie groups the letters are omitted: they would not be informative."""
 
@@ -47,10 +48,10 @@ class RankEstimate(msgspec.Struct, frozen=True, kw_only=True):
 class Standings(msgspec.Struct, frozen=True, kw_only=True):
     """Rank estimates of a suite; entries with a cell without spread are left out."""
 
-    rows: tuple[RankEstimate, ...]
-    gap: float | None
+    rows: tuple[RankEstimate, ...] = ()
+    gap: float | None = None
     """Half width of the 95 % interval of a difference of two agents' rank scores, median over pairs."""
-    over: str
+    over: str = ""
     """`cases`, `runs and cases`, or both if cells differ."""
 
     def of(self, entry: str) -> RankEstimate | None:
@@ -59,7 +60,7 @@ class Standings(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def standings(
-    samples: Mapping[tuple[str, str], Sample],
+    samples: Mapping[tuple[str, str], Cell],
     scores: Mapping[str, float | None],
     environments: Sequence[str],
     *,
@@ -67,66 +68,55 @@ def standings(
     resamples: int = RESAMPLES,
 ) -> Standings:
     """Rank estimates of the entries of `scores` (entry to its observed rank score), best first. All have a sample on
-    each environment.
-
-    On a single environment two entries are distinguished only if `compared` tells them apart as well.
-    """
+    each environment. On a single one two entries are distinguished only if `compared` tells them apart as well."""
     known = {entry: -math.inf if score is None else score for entry, score in scores.items()}
     entries = sorted(scores, key=lambda entry: (-known[entry], by_name(entry)))
+    if len(entries) < 2:
+        return Standings()
     n_pairs = len(entries) * (len(entries) - 1) // 2
     resamples = max(resamples, math.ceil(4 * n_pairs / ALPHA))
-    if len(entries) < 2:
-        return Standings(rows=(), gap=None, over="")
-    drawn, spread = _drawn_scores(samples, entries, environments, resamples)
-    sure = [i for i, entry in enumerate(entries) if entry in spread and scores[entry] is not None]
+    drawn = _drawn_scores(samples, entries, environments, resamples)
+    sure = [entry for entry in entries if entry in drawn and scores[entry] is not None]
     if len(sure) < 2:
-        return Standings(rows=(), gap=None, over="")
+        return Standings()
     apart = _distinguished(drawn, sure)
     if len(environments) == 1:
-        told = {
-            frozenset((pair.first, pair.second)) for pair in compared if pair.verdict in ("first", "second")
-        }
+        told = {frozenset((one.first, one.second)) for one in compared if one.verdict in ("first", "second")}
         failed = {entry for entry in entries if samples[entry, environments[0]].scores is None}
-        apart = {
-            (a, b)
-            for a, b in apart
-            if (both := frozenset((entries[sure[a]], entries[sure[b]]))) in told or both & failed
-        }
-    letters = dict(zip(sure, _letters(len(sure), apart), strict=True))
+        apart = {both for both in apart if frozenset(both) in told or failed.intersection(both)}
     rows: list[RankEstimate] = []
-    for place, i in enumerate(sure):
-        low, high = np.quantile(drawn[i], [ALPHA / 2.0, 1.0 - ALPHA / 2.0])
-        observed = scores[entries[i]] or 0.0
+    for entry, letters in zip(sure, _letters(sure, apart), strict=True):
+        low, high = np.quantile(drawn[entry], _BOUNDS)
+        observed = scores[entry] or 0.0
         rows.append(
             RankEstimate(
-                entry=entries[i],
+                entry=entry,
                 score_low=min(float(low), observed),
                 score_high=max(float(high), observed),
-                rank_low=1 + sum(worse == place for _, worse in apart),
-                rank_high=len(entries) - sum(better == place for better, _ in apart),
-                ties=letters[i],
+                rank_low=1 + sum(worse == entry for _, worse in apart),
+                rank_high=len(entries) - sum(better == entry for better, _ in apart),
+                ties=letters,
             )
         )
-    fixed = {sample.entry for sample in samples.values() if sample.is_fixed}
-    agents = [i for i in sure if entries[i] not in fixed]
+    fixed = {sample.entry for sample in samples.values() if sample.fixed is not None}
     halves = [
-        float(np.diff(np.quantile(drawn[i] - drawn[j], [ALPHA / 2.0, 1.0 - ALPHA / 2.0]))[0]) / 2.0
-        for i, j in itertools.combinations(agents, 2)
+        float(np.diff(np.quantile(drawn[one] - drawn[other], _BOUNDS))[0]) / 2.0
+        for one, other in itertools.combinations([entry for entry in sure if entry not in fixed], 2)
     ]
-    kinds = {len(sample.runs) > 1 for sample in samples.values() if not sample.is_fixed}
+    kinds = {len(sample.runs) > 1 for sample in samples.values() if sample.fixed is None}
     over = " or ".join(text for many, text in ((False, "cases"), (True, "runs and cases")) if many in kinds)
     return Standings(rows=tuple(rows), gap=float(np.median(halves)) if halves else None, over=over)
 
 
 def _drawn_scores(
-    samples: Mapping[tuple[str, str], Sample],
+    samples: Mapping[tuple[str, str], Cell],
     entries: Sequence[str],
     environments: Sequence[str],
     resamples: int,
-) -> tuple[Floats, set[str]]:
-    """(entries, resamples) rank scores, and the entries that vary on every environment."""
+) -> dict[str, Floats]:
+    """Resampled rank scores of the entries that vary on every environment."""
     total = np.zeros((len(entries), resamples))
-    spread = set(entries)
+    varying = set(entries)
     for number, env in enumerate(environments):
         means = np.empty_like(total)
         for i, entry in enumerate(entries):
@@ -136,61 +126,63 @@ def _drawn_scores(
             elif (drawn := _drawn_mean(sample, scores, i, number, resamples)) is not None:
                 means[i] = drawn
             else:
-                spread.discard(entry)
+                varying.discard(entry)
                 means[i] = np.mean(scores)
         above = np.zeros_like(means)
         for row in means:
             above += row > means
         total += 1.0 - above / (len(entries) - 1)
-    return total / len(environments), spread
+    mean = total / len(environments)
+    return {entry: mean[i] for i, entry in enumerate(entries) if entry in varying}
 
 
-def _drawn_mean(
-    sample: Sample, known: Sequence[float], entry: int, env: int, resamples: int
-) -> Floats | None:
+def _drawn_mean(sample: Cell, known: Sequence[float], entry: int, env: int, resamples: int) -> Floats | None:
     """Resampled means; None if the sample shows no spread."""
-    common = matched([sample])
-    seed = 1000 + 97 * entry + 10_007 * env
-    scores, returns = np.array(known), np.zeros((1, 1))
-    if common is not None:
-        returns = common.returns[0]
+    scores, returns = np.array(known), returns_in(sample)
+    if returns is None:
+        returns = np.zeros((1, 1))
+    else:
         scores = returns.mean(axis=1)
     if len(scores) < 2 and returns.shape[1] < 2:
         return None
     by_case = returns.mean(axis=0)
+    seed = 1000 + 97 * entry + 10_007 * env
     drawn: Floats = scores.mean() + t_weights(len(scores), resamples, seed) @ (scores - scores.mean())
     # By `env` alone: all entries play the same cases.
     drawn += t_weights(len(by_case), resamples, env) @ (by_case - by_case.mean())
     return drawn
 
 
-def _distinguished(drawn: Floats, sure: Sequence[int]) -> set[tuple[int, int]]:
-    """Distinguished pairs of places in `sure`, the better one first."""
-    places = list(itertools.combinations(range(len(sure)), 2))
+def _distinguished(drawn: Mapping[str, Floats], entries: Sequence[str]) -> set[tuple[str, str]]:
+    """Distinguished pairs of entries, the better one first."""
+    places = list(itertools.combinations(entries, 2))
     tails: list[tuple[float, bool]] = []
-    for a, b in places:
-        gap = drawn[sure[a]] - drawn[sure[b]]
+    for one, other in places:
+        gap = drawn[one] - drawn[other]
         n_below, n_above = int((gap <= 1e-12).sum()), int((gap >= -1e-12).sum())
         tails.append((min(1.0, 2.0 * (min(n_below, n_above) + 1) / (len(gap) + 1)), n_below <= n_above))
     corrected = holm([p for p, _ in tails])
     return {
-        (a, b) if a_better else (b, a)
-        for (a, b), (_, a_better), p in zip(places, tails, corrected, strict=True)
+        place if is_first_better else place[::-1]
+        for place, (_, is_first_better), p in zip(places, tails, corrected, strict=True)
         if p is not None and p <= ALPHA
     }
 
 
-def _letters(n: int, apart: set[tuple[int, int]]) -> list[str]:
-    """Letters of n entries; two share one exactly if they are not distinguished (Piepho 2004, insert and absorb)."""
-    groups: list[frozenset[int]] = [frozenset(range(n))]
-    for a, b in sorted(apart):
+def _letters(entries: Sequence[str], apart: set[tuple[str, str]]) -> list[str]:
+    """Letters of each entry; two share one exactly if they are not distinguished (Piepho 2004, insert and absorb)."""
+    place = {entry: i for i, entry in enumerate(entries)}
+    groups: list[frozenset[int]] = [frozenset(place.values())]
+    for a, b in sorted((place[better], place[worse]) for better, worse in apart):
         split = [
             part for group in groups for part in ((group - {a}, group - {b}) if {a, b} <= group else (group,))
         ]
         distinct = list(dict.fromkeys(split))
         groups = [group for group in distinct if not any(group < other for other in distinct)]
         if len(groups) > MAX_GROUPS:
-            return ["…"] * n
+            return ["…"] * len(entries)
     groups.sort(key=sorted)
     letters = [string.ascii_lowercase[i % 26] + (str(i // 26) if i >= 26 else "") for i in range(len(groups))]
-    return ["".join(one for one, group in zip(letters, groups, strict=True) if i in group) for i in range(n)]
+    return [
+        "".join(one for one, group in zip(letters, groups, strict=True) if i in group) for i in place.values()
+    ]

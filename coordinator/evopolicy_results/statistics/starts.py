@@ -16,8 +16,8 @@ from evopolicy_common.messages.run_settings import Start
 from evopolicy_common.statistics.resampling import RESAMPLES
 from evopolicy_results.reading.environments import grouped
 from evopolicy_results.reading.records import Run
+from evopolicy_results.scoring.scores import Cell, returns_of
 from evopolicy_results.statistics.pairs import Pair, pairs
-from evopolicy_results.statistics.samples import Sample, returns_of
 
 VARIED = ("feedback detail", "text of AGENTS.md", "prompts")
 """Settings, by their names in `comparability`, in which runs from one state may differ."""
@@ -49,24 +49,22 @@ def start_groups(runs: Sequence[Run], *, resamples: int = RESAMPLES) -> list[Sta
     names = {run.record.run: f"{run.entry} / {run.record.exp_id}" for run in runs if run.record.run}
     out = []
     for (parent, _, _), group in by_state(runs).items():
-        labels = _labels(group)
-        by_label = {
-            each: [run for run, label in zip(group, labels, strict=True) if label == each] for each in labels
-        }
-        env, start = group[0].env, group[0].record.start
-        assert start is not None
+        variants: dict[str, list[Run]] = {}
+        for run, label in zip(group, _labels(group), strict=True):
+            variants.setdefault(label, []).append(run)
+        env, starts = group[0].env, [run.record.start for run in group if run.record.start is not None]
         samples = {
-            (label, env): Sample(entry=label, env=env, runs=tuple(map(returns_of, several)))
-            for label, several in by_label.items()
+            (label, env): Cell(entry=label, env=env, runs=tuple(map(returns_of, several)))
+            for label, several in variants.items()
         }
         out.append(
             StartGroup(
-                start=start,
+                start=starts[0],
                 parent=names.get(parent, parent),
                 env=env,
-                variants={label: len(several) for label, several in by_label.items()},
-                parent_scored=any(run.record.start and run.record.start.parent_scored for run in group),
-                pairs=tuple(pairs(samples, list(by_label), [env], resamples=resamples)),
+                variants={label: len(several) for label, several in variants.items()},
+                parent_scored=any(start.parent_scored for start in starts),
+                pairs=tuple(pairs(samples, list(variants), [env], resamples=resamples)),
             )
         )
     return out

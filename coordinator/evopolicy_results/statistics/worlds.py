@@ -20,10 +20,9 @@ from evopolicy_common.catalogue.anchors import Anchor, anchor
 from evopolicy_common.catalogue.worlds import unchanged
 from evopolicy_common.statistics.intervals import Estimate, Over, Stratum, stratified, stratum, stratum_of
 from evopolicy_results.reading.environments import family_of, grouped
-from evopolicy_results.reading.records import Run
 from evopolicy_results.scoring.evolution import Evolution
-from evopolicy_results.scoring.scores import ScoreTable
-from evopolicy_results.statistics.samples import Sample, matched, samples_of
+from evopolicy_results.scoring.scores import Cell, ScoreTable
+from evopolicy_results.statistics.pairs import returns_in
 
 N_POINTS = 64
 """Intervals of episodes between the points of a curve."""
@@ -69,24 +68,22 @@ class _Cell(msgspec.Struct, frozen=True):
     n_worlds: int
 
 
-def worlds_of(runs: Sequence[Run], table: ScoreTable, evolutions: Iterable[Evolution]) -> Worlds | None:
+def worlds_of(table: ScoreTable, evolutions: Iterable[Evolution]) -> Worlds | None:
     """None unless some entry has scores in an environment and worlds of it."""
     altered = (env for env in table.environments if unchanged(env) != env and anchor(env) is not None)
     pairs = grouped(altered, unchanged)
-    samples = samples_of(runs, table) if pairs else {}
     paired: list[Paired] = []
     for entry in table.entries:
         cells = [
             cell
             for env, worlds in pairs.items()
-            if (cell := _cell(env, [samples.get((entry, each)) for each in (env, *worlds)])) is not None
+            if (cell := _cell(env, [table.cells.get((entry, each)) for each in (env, *worlds)])) is not None
         ]
-        families = list(dict.fromkeys(family_of(cell.env) for cell in cells))
         scopes = {"": cells} if len(cells) > 1 else {}
-        if len(families) > 1:
-            scopes |= {family: [one for one in cells if family_of(one.env) == family] for family in families}
+        families = grouped(cells, lambda cell: family_of(cell.env))
+        scopes |= families if len(families) > 1 else {}
+        scopes |= {cell.env: [cell] for cell in cells}
         paired += [_paired(entry, scope, own) for scope, own in scopes.items()]
-        paired += [_paired(entry, cell.env, [cell]) for cell in cells]
     if not paired:
         return None
     by_entry = grouped(evolutions, lambda one: one.entry)
@@ -94,7 +91,7 @@ def worlds_of(runs: Sequence[Run], table: ScoreTable, evolutions: Iterable[Evolu
     return Worlds(paired=tuple(paired), curves={entry: curve for entry, curve in curves.items() if curve})
 
 
-def _cell(env: str, samples: Sequence[Sample | None]) -> _Cell | None:
+def _cell(env: str, samples: Sequence[Cell | None]) -> _Cell | None:
     """None if the environment, or one of the report's worlds of it, has no score of the entry."""
     scale = anchor(env)
     known = [sample for sample in samples if sample is not None and sample.scores is not None]
@@ -104,11 +101,10 @@ def _cell(env: str, samples: Sequence[Sample | None]) -> _Cell | None:
     return _Cell(env, first, stratum_of([one.value for one in others]), len(others))
 
 
-def _stratum(sample: Sample, scale: Anchor) -> Stratum:
-    common = matched([sample])
-    if common is None:
+def _stratum(sample: Cell, scale: Anchor) -> Stratum:
+    if (returns := returns_in(sample)) is None:
         return stratum_of([scale.normalised(score) for score in sample.scores or ()])
-    return stratum((common.returns[0] - scale.random.mean) / scale.width)
+    return stratum((returns - scale.random.mean) / scale.width)
 
 
 def _paired(entry: str, scope: str, cells: Sequence[_Cell]) -> Paired:

@@ -54,8 +54,7 @@ class Look(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def looks(agents: Sequence[str], reference: str | None) -> dict[str, Look]:
-    """Assigns each agent a look by the place of its name among all agents of the report; the reference is grey and
-    dashed."""
+    """Each agent's look, by the place of its name among all agents of the report; the reference is grey and dashed."""
     out = {
         agent: Look(
             colour=COLOURS[place % len(COLOURS)],

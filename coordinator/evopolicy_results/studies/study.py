@@ -9,9 +9,15 @@ import msgspec
 
 from evopolicy_common.statistics.intervals import Estimate
 from evopolicy_common.statistics.resampling import RESAMPLES
-from evopolicy_results.behaviour.audit import AuditSignals, TokenUse, audit_signals, mean_phases, token_use
-from evopolicy_results.behaviour.edits import EditRates, edit_rates
-from evopolicy_results.behaviour.structure import EditSizeBin, StructureMean, edit_size_bins, structure_means
+from evopolicy_results.behaviour.audit import TokenUse, mean_phases, token_use
+from evopolicy_results.behaviour.edits import (
+    EditRates,
+    EditSizeBin,
+    StructureMean,
+    edit_rates,
+    edit_size_bins,
+    structure_means,
+)
 from evopolicy_results.reading.comparability import UNKNOWN_ISOLATION, MixedRunsError, Mixture, mixtures
 from evopolicy_results.reading.environments import (
     by_name,
@@ -24,14 +30,18 @@ from evopolicy_results.reading.parallel import Processes
 from evopolicy_results.reading.reader import load_runs, rescored
 from evopolicy_results.reading.records import LeftOut, Run
 from evopolicy_results.scoring.evolution import Evolution, evolutions
-from evopolicy_results.scoring.normalised import Normalised, normalised, scales_of
-from evopolicy_results.scoring.ranking import Leaderboard, leaderboard
-from evopolicy_results.scoring.scores import ScoreTable, score_table
+from evopolicy_results.scoring.scores import (
+    Leaderboard,
+    Normalised,
+    ScoreTable,
+    leaderboard,
+    normalised,
+    scales_of,
+    score_table,
+)
 from evopolicy_results.statistics.aggregates import Aggregate, Improvement, aggregates
 from evopolicy_results.statistics.generalisation import Generalisation, generalisation, optimism
-from evopolicy_results.statistics.pairs import Pair, cell_mean, pairs
-from evopolicy_results.statistics.resolution import Resolution, overall, resolutions
-from evopolicy_results.statistics.samples import samples_of
+from evopolicy_results.statistics.pairs import Pair, Resolution, cell_mean, overall, pairs, resolutions
 from evopolicy_results.statistics.standings import Standings, standings
 from evopolicy_results.statistics.starts import VARIED, StartGroup, by_state, start_groups
 from evopolicy_results.statistics.worlds import Worlds, worlds_of
@@ -87,11 +97,10 @@ class Study(msgspec.Struct, frozen=True, kw_only=True):
     structure: tuple[StructureMean, ...]
     edit_sizes: tuple[EditSizeBin, ...]
     tokens: tuple[TokenUse, ...]
-    audit: tuple[AuditSignals, ...]
     phases: dict[str, dict[str, float]]
     """By entry, the mean wall time of a run in each phase, in seconds."""
     starts: tuple[StartGroup, ...] = ()
-    """Runs that start from a submit of an earlier run: all other metrics but `audit` leave them out."""
+    """Runs that start from a submit of an earlier run: all other metrics leave them out."""
     worlds: Worlds | None = None
     """Environments beside their worlds; None if no entry has played both."""
 
@@ -128,11 +137,8 @@ def study_of(
 ) -> Study:
     """Computes every metric. Raises MixedRunsError when the runs are not one comparison and `allow_mixed` is false.
 
-    `allow_unknown` allows runs without a record of their hidden isolation beside runs with one; `allow_mixed` alone
-    does not.
-
-    `scores` adds a table of scores without run directories (such as the paper's). It has no submits, so it appears
-    only in the leaderboard and normalised performance. Its entries must differ from those of the runs.
+    Only `allow_unknown` allows runs without a record of their hidden isolation beside runs with one. `scores` adds a
+    table of scores without run directories (such as the paper's), with other entries than those of the runs.
     """
     learn_names(run.record for run in runs)
     whole = [run for run in runs if run.record.start is None]
@@ -147,12 +153,8 @@ def study_of(
     if refused:
         raise MixedRunsError(refused)
     every, ordered = _in_order(runs), _in_order(whole)
-    references = {
-        env: cell.mean
-        for (entry, env), cell in table.cells.items()
-        if entry == table.reference and cell.mean is not None
-    }
-    curves = tuple(evolutions(ordered, references))
+    random = {env: cell.mean for (entry, env), cell in table.cells.items() if entry == table.reference}
+    curves = evolutions(ordered, {env: mean for env, mean in random.items() if mean is not None})
     return Study(
         runs=tuple(every),
         left_out=tuple(left_out),
@@ -161,15 +163,14 @@ def study_of(
             _suite(name, table.restricted(envs), ordered, resamples)
             for name, envs in suites_of(table.environments).items()
         ),
-        evolutions=curves,
+        evolutions=tuple(curves),
         edit_rates=tuple(edit_rates(ordered)),
         structure=tuple(structure_means(ordered)),
         edit_sizes=tuple(edit_size_bins(ordered)),
         tokens=tuple(token_use(ordered)),
-        audit=tuple(map(audit_signals, every)),
         phases=mean_phases(every),
         starts=tuple(start_groups(every, resamples=resamples)),
-        worlds=worlds_of(ordered, table, curves),
+        worlds=worlds_of(table, curves),
     )
 
 
@@ -190,13 +191,13 @@ def study(
 
 
 def _suite(name: str, table: ScoreTable, runs: Sequence[Run], resamples: int) -> Suite:
-    """`runs` supply the returns by case, and may include others than those of `table`."""
     board, environments, scales = leaderboard(table), table.environments, scales_of(table)
-    samples = samples_of(runs, table)
-    compared = pairs(samples, table.entries, environments, resamples=resamples)
-    means = {key: mean for key, sample in samples.items() if (mean := cell_mean(sample, resamples=resamples))}
-    resolved = resolutions(samples, compared, table.agents, scales, environments)
-    alone, against = aggregates(samples, board.agents, scales, resamples=resamples)
+    compared = pairs(table.cells, table.entries, environments, resamples=resamples)
+    means = {
+        key: mean for key, sample in table.cells.items() if (mean := cell_mean(sample, resamples=resamples))
+    }
+    resolved = resolutions(table.cells, compared, table.agents, scales, environments)
+    alone, against = aggregates(table.cells, board.agents, scales, resamples=resamples)
     general = generalisation((run for run in runs if run.env in set(environments)), scales)
     scores = {row.entry: row.score for row in board.standings}
     return Suite(
@@ -207,7 +208,7 @@ def _suite(name: str, table: ScoreTable, runs: Sequence[Run], resamples: int) ->
         statistics=SuiteStatistics(
             means=means,
             pairs=tuple(compared),
-            standings=standings(samples, scores, environments, compared=compared, resamples=resamples),
+            standings=standings(table.cells, scores, environments, compared=compared, resamples=resamples),
             resolutions=tuple(resolved),
             overall=overall(resolved),
             aggregates=tuple(alone),
@@ -225,21 +226,17 @@ def _in_order(runs: Sequence[Run]) -> list[Run]:
 
 def _merged(table: ScoreTable, scores: ScoreTable) -> tuple[ScoreTable, list[Mixture]]:
     """Merges both tables, and returns the mixtures of environments on which both have scores."""
-    twice = set(table.agents) & set(scores.agents)
-    if twice:
-        raise MixedRunsError(
-            [Mixture(what="entry from runs and from a CSV", where=n, values={}) for n in sorted(twice)]
-        )
-    cells = {**scores.cells, **table.cells}
-    harness = {**scores.harness, **table.harness}
-    if table.reference is not None and scores.reference is not None and table.reference != scores.reference:
-        for env in scores.environments:
-            cells.pop((scores.reference, env), None)
-        del harness[scores.reference]
-    reference = table.reference or scores.reference
-    shared = set(table.environments) & set(scores.environments)
+    if twice := set(table.agents) & set(scores.agents):
+        what = "entry from runs and from a CSV"
+        raise MixedRunsError([Mixture(what=what, where=name, values={}) for name in sorted(twice)])
+    other = scores.reference if table.reference not in (None, scores.reference) else None
+    merged = ScoreTable(
+        cells={key: cell for key, cell in scores.cells.items() if key[0] != other} | table.cells,
+        harness={entry: text for entry, text in scores.harness.items() if entry != other} | table.harness,
+        reference=table.reference or scores.reference,
+    )
     mixed = [
         Mixture(what="scores from runs and from a CSV", where=env, values={"runs": 1, "CSV": 1})
-        for env in ordered_environments(shared)
+        for env in ordered_environments(set(table.environments) & set(scores.environments))
     ]
-    return ScoreTable(cells=cells, harness=harness, reference=reference), mixed
+    return merged, mixed

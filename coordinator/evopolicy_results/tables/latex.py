@@ -29,6 +29,9 @@ _UNBROKEN = 20
 """Length in characters above which a word without a natural break may be broken."""
 
 _JOINER = "\N{WORD JOINER}"
+_GREEK = (
+    "αalpha βbeta γgamma δdelta εepsilon θtheta λlambda μmu πpi ρrho σsigma τtau ωomega ΔDelta ΣSigma ΩOmega"
+)
 _CHARACTERS = {
     "\\": r"\textbackslash{}",
     **{character: f"\\{character}" for character in "&%$#_{}"},
@@ -58,9 +61,7 @@ _CHARACTERS = {
     "°": r"$^\circ$",
     "²": "$^2$",
     "µ": r"$\mu$",
-    **{name[0]: rf"$\{name[1:]}$" for name in ("αalpha", "βbeta", "γgamma", "δdelta", "εepsilon", "θtheta")},
-    **{name[0]: rf"$\{name[1:]}$" for name in ("λlambda", "μmu", "πpi", "ρrho", "σsigma", "τtau", "ωomega")},
-    **{name[0]: rf"$\{name[1:]}$" for name in ("ΔDelta", "ΣSigma", "ΩOmega")},
+    **{name[0]: rf"$\{name[1:]}$" for name in _GREEK.split()},
     _JOINER: "{}",
 }
 _ACCENTED = frozenset(map(chr, range(0xC0, 0x100))) - set("×÷ÐÞðþ")
@@ -115,15 +116,8 @@ def to_latex(table: Table) -> str:
     if is_long:
         out = ["% needs \\usepackage{array,booktabs,longtable}", "\\begingroup", *small]
     else:
-        out = [
-            "% needs \\usepackage{array,booktabs}",
-            "\\begin{table}",
-            "\\centering",
-            caption,
-            label,
-            *small,
-        ]
-        out.append("\\par\\vspace{0.5em}")
+        out = ["% needs \\usepackage{array,booktabs}", "\\begin{table}", "\\centering", caption, label]
+        out += [*small, "\\par\\vspace{0.5em}"]
     for number, panel in enumerate(panels):
         spec = "".join(map(_spec, panel))
         heading = ["\\toprule", " & ".join(map(_heading, panel)) + " \\\\", "\\midrule"]

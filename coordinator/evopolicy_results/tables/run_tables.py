@@ -6,13 +6,14 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Iterable
 from operator import itemgetter
-from typing import Any
+from statistics import fmean
+from typing import Any, NamedTuple
 
 from msgspec.structs import replace
 
 from evopolicy_common import catalogue
-from evopolicy_results.behaviour.audit import PHASES, AuditSignals
-from evopolicy_results.behaviour.edits import demand_of
+from evopolicy_results.behaviour.audit import PHASES
+from evopolicy_results.behaviour.edits import classify, demand_of
 from evopolicy_results.behaviour.trace import Trace
 from evopolicy_results.reading.agent_log import Evidence
 from evopolicy_results.reading.environments import (
@@ -23,38 +24,71 @@ from evopolicy_results.reading.environments import (
     title_of,
 )
 from evopolicy_results.reading.records import Run, path_text
-from evopolicy_results.scan.signals import TITLES, Signal
+from evopolicy_results.scan.signals import TITLES
 from evopolicy_results.studies.study import Study
-from evopolicy_results.tables.table import Column, Table, rows_of, tabulated
+from evopolicy_results.tables.table import Column, Kind, Table, at, rows_of, tabulated
 
 ENTRY = Column("entry", "Agent")
 HARNESS = Column("harness", "Harness")
 ENV = Column("env", "Environment", of=lambda record: title_of(record.env))
 RUN = Column("run", "Run", of=lambda record: _short(record.run))
-RUNS = Column("runs", "Runs", "integer", of=lambda record: record.n_runs)
+RUNS = Column("runs", "Runs", "integer", of="n_runs")
 
 _COUNTERS = frozenset({"reprompted", "paused_s", "requests_failed", "resumed"})
 """Counters of a run's course that a harness stores among its settings; they are not settings."""
 _MAX_QUOTE = 240
+_JOURNAL = (
+    "Entry with the run's result, and the journal's head there. A head that you noted earlier shows whether the"
+    " journal was rewritten."
+)
 
 
 def tables_of_runs(study: Study) -> list[Table]:
-    signals = [(run, each) for run in study.runs for each in run.signals]
-    simulators = [(run, each) for run in study.runs for each in run.simulator_flags]
+    signals = [_Of(run, each) for run in study.runs for each in run.signals]
+    simulators = [_Of(run, each) for run in study.runs for each in run.simulator_flags]
+    published = [run for run in study.runs if run.is_published]
+    missing = [
+        (table, value, sum(not (path and at(run, path)) for run in published))
+        for table, value, path in _MISSING
+    ]
     return [
-        _runs(study),
-        _audit(study),
-        _evidence(signals, "signals", "What deserves a look", _SIGNALS),
-        _evidence(simulators, "simulator_flags", "Code that looks like a simulator", _SIMULATORS),
-        _agents(study),
-        _environments(study),
-        _missing(study),
         tabulated(
-            study.left_out,
+            "runs",
+            "Runs",
+            (
+                ENV,
+                ENTRY,
+                replace(RUN, of=lambda run: _short(run.name)),
+                Column("submits", "Submits", "integer", of=lambda run: len(run.submits)),
+                Column("score", "Held-out mean", "number"),
+                Column("journal", "Journal", note=_JOURNAL, of=_journal),
+            ),
+            study.runs,
+            "Open a run for its feedback use, timeline, checkpoints and differences.",
+            run=lambda run: run.name,
+        ),
+        _audit(study.runs),
+        _evidence("signals", "What deserves a look", signals, _SIGNALS),
+        _evidence("simulator_flags", "Code that looks like a simulator", simulators, _SIMULATORS),
+        _agents(study.runs),
+        _environments(study.runs),
+        tabulated(
+            "not_told",
+            "Missing values",
+            (
+                Column("table", "Table", of=itemgetter(0)),
+                Column("what", "Missing value", of=itemgetter(1)),
+                Column("runs", "Runs", "integer", of=itemgetter(2)),
+            ),
+            [each for each in missing if each[2]],
+            "Values that run directories of the published software lack, by table. They are left empty.",
+        ),
+        tabulated(
+            "left_out",
+            "Left out",
             (Column("path", "Folder", of=lambda item: path_text(item.path)), Column("reason", "Reason")),
-            name="left_out",
-            title="Left out",
-            caption="Folders that are no complete run, and why. They are in no table and no figure.",
+            study.left_out,
+            "Folders that are no complete run, and why. They are in no table and no figure.",
         ),
     ]
 
@@ -70,58 +104,33 @@ def _short(run: str) -> str:
     return run.rsplit(" / ", 1)[-1]
 
 
-def _runs(study: Study) -> Table:
-    def journal(run: Run) -> str | None:
-        """None for runs from before the journal existed."""
-        place = run.record.committed
-        return None if place is None or place.ended is None else f"{place.ended} {place.ended_head[:16]}"
-
-    note = (
-        "Entry with the run's result, and the journal's head there. A head that you noted earlier shows whether the"
-        " journal was rewritten."
-    )
-    return tabulated(
-        study.runs,
-        (
-            ENV,
-            ENTRY,
-            replace(RUN, of=lambda run: _short(run.name)),
-            Column("submits", "Submits", "integer", of=lambda run: len(run.submits)),
-            Column("score", "Held-out mean", "number"),
-            Column("journal", "Journal", note=note, of=journal),
-        ),
-        run=lambda run: run.name,
-        name="runs",
-        title="Runs",
-        caption="Open a run for its feedback use, timeline, checkpoints and differences.",
-    )
+def _journal(run: Run) -> str | None:
+    """None for runs from before the journal existed."""
+    place = run.record.committed
+    return None if place is None or place.ended is None else f"{place.ended} {place.ended_head[:16]}"
 
 
-def _agents(study: Study) -> Table:
+def _agents(runs: Iterable[Run]) -> Table:
     """One row per setup of an entry: several rows show that its runs differ."""
-    note = "exclusive: hidden episodes and agents never shared a kernel."
+    version = "Of the harness's program."
+    isolation = "exclusive: hidden episodes and agents never shared a kernel."
     setup = (
         ENTRY,
         HARNESS,
-        Column(
-            "cli_version",
-            "Version",
-            note="Of the harness's program.",
-            of=lambda run: run.record.agent.cli_version,
-        ),
-        Column("model", "Model string", of=lambda run: run.record.agent.model_string),
+        Column("cli_version", "Version", note=version, of="record.agent.cli_version"),
+        Column("model", "Model string", of="record.agent.model_string"),
         Column("settings", "Settings", of=_settings),
-        Column("jail", "Jail", of=lambda run: run.record.jail),
-        Column("hidden_isolation", "Hidden isolation", note=note, of=lambda run: run.record.hidden_isolation),
+        Column("jail", "Jail", of="record.jail"),
+        Column(
+            "hidden_isolation", "Hidden isolation", note=isolation, of=lambda r: r.record.hidden_isolation
+        ),
     )
-    counts = Counter(tuple(value or "" for value in row.values()) for row in rows_of(study.runs, setup))
+    counts = Counter(tuple(value or "" for value in row.values()) for row in rows_of(runs, setup))
     return Table(
         name="agents",
         title="Agents",
-        caption=(
-            "How each agent was set up, as its run directories tell; an agent with several rows was not the same in all"
-            " of its runs."
-        ),
+        caption="How each agent was set up, as its run directories tell; an agent with several rows was not"
+        " the same in all of its runs.",
         columns=(*setup, RUNS),
         rows=tuple(
             {**{c.key: value or None for c, value in zip(setup, values, strict=True)}, "runs": counts[values]}
@@ -132,89 +141,87 @@ def _agents(study: Study) -> Table:
 
 def _settings(run: Run) -> str:
     """The plain settings on one line; lists and paths of the original machine are only in run.json."""
-    settings = run.record.agent.settings
-    plain = {
-        key: value
-        for key, value in settings.items()
+    texts: dict[type, Callable[[Any], Any]] = {bool: _YES_NO.get, float: "{:g}".format}
+    return ", ".join(
+        f"{key} {texts.get(type(value), str)(value)}"
+        for key, value in run.record.agent.settings.items()
         if isinstance(value, str | int | float)
         and key not in _COUNTERS
         and not str(value).startswith(("/", "~"))
-    }
-    words = {True: "yes", False: "no"}
-    return ", ".join(
-        f"{key} {words[value] if isinstance(value, bool) else f'{value:g}' if isinstance(value, float) else value}"
-        for key, value in plain.items()
     )
 
 
-def _environments(study: Study) -> Table:
-    by_env = grouped(study.runs, lambda run: run.env)
+def _environments(runs: Iterable[Run]) -> Table:
+    by_env = grouped(runs, lambda run: run.env)
 
-    def common(value_of: Callable[[Run], Any]) -> Callable[[str], Any]:
-        return lambda env: one_or_all(map(value_of, by_env[env]))
+    def common(key: str, title: str, kind: Kind, of: Callable[[Run], Any], note: str = "") -> Column:
+        return Column(key, title, kind, note=note, of=lambda env: one_or_all(map(of, by_env[env])))
 
-    def dimension(name: str) -> Callable[[str], Any]:
-        return common(lambda run: getattr(run.record.experiment_dimensions, name) or None)
+    def dimension(name: str) -> Callable[[Run], Any]:
+        return lambda run: getattr(run.record.experiment_dimensions, name) or None
 
-    known = catalogue.entries().get
-    version = Column("version", "Version", of=common(lambda run: run.record.versions.env))
-    columns = (
-        replace(ENV, of=title_of),
-        Column("family", "Family", of=lambda env: family_title(family_of(env))),
-        Column("id", "Suite id", of=str),
-        version,
-        Column("spaces", "Obs./action", of=lambda env: (e := known(env)) and f"{e.observation}/{e.action}"),
-        Column("demand", "Demand", of=demand_of),
-        Column(
-            "steps",
-            "Longest episode (steps)",
-            "integer",
-            of=lambda env: (e := known(env)) and e.max_episode_steps,
-        ),
-        Column(
-            "budget", "Budget", "integer", note="Train episodes of a run.", of=common(lambda run: run.budget)
-        ),
-        Column("submit", "Episodes a submit", note="Fewest to most.", of=common(lambda run: run.submit_size)),
-        Column("validation", "Validation cases", "integer", of=dimension("n_validation")),
-        Column("heldout", "Held-out cases", "integer", of=dimension("n_heldout")),
-        Column(
-            "scope", "Policy scope", note="How long one policy object lives.", of=dimension("policy_scope")
-        ),
-    )
+    def spaces(env: str) -> str | None:
+        return f"{known[env].observation}/{known[env].action}" if env in known else None
+
+    def steps(env: str) -> int | None:
+        return known[env].max_episode_steps if env in known else None
+
+    known = catalogue.entries()
+    version = common("version", "Version", "text", lambda run: run.record.versions.env)
+    note = "How long one policy object lives."
     table = tabulated(
+        "environments",
+        "Environments",
+        (
+            replace(ENV, of=title_of),
+            Column("family", "Family", of=lambda env: family_title(family_of(env))),
+            Column("id", "Suite id", of=str),
+            version,
+            Column("spaces", "Obs./action", of=spaces),
+            Column("demand", "Demand", of=demand_of),
+            Column("steps", "Longest episode (steps)", "integer", of=steps),
+            common("budget", "Budget", "integer", lambda run: run.budget, "Train episodes of a run."),
+            common("submit", "Episodes a submit", "text", lambda run: run.submit_size, "Fewest to most."),
+            common("validation", "Validation cases", "integer", dimension("n_validation")),
+            common("heldout", "Held-out cases", "integer", dimension("n_heldout")),
+            common("scope", "Policy scope", "text", dimension("policy_scope"), note),
+        ),
         ordered_environments(by_env),
-        columns,
-        name="environments",
-        title="Environments",
-        caption="What was played: cases of a run's hidden splits, and the train episodes that it could spend.",
+        "What was played: cases of a run's hidden splits, and the train episodes that it could spend.",
     )
-    return replace(table, columns=(*(column for column in columns if column is not version), version))
+    return replace(table, columns=(*(each for each in table.columns if each is not version), version))
 
 
+class _Of(NamedTuple):
+    """A submit's row of a trace, or a signal, with its run."""
+
+    run: Run
+    each: Any
+
+
+_YES_NO = {True: "yes", False: "no"}
 _FEEDBACK = (
-    Column("env", "Environment", of=lambda one: title_of(one[0].env)),
-    Column("entry", "Agent", of=lambda one: one[0].entry),
-    Column("run", "Run", of=lambda one: _short(one[0].name)),
-    Column("submit", "Submit", of=lambda one: one[1].submit.label),
-    Column("before", "Budget before", "integer", of=lambda one: one[1].submit.consumed_before),
-    Column("after", "Budget after", "integer", of=lambda one: one[1].submit.consumed),
-    Column("read", "Evidence read", of=lambda one: ", ".join(getattr(one[1].evidence, "read", ())) or None),
-    Column("said", "The agent's own words", of=lambda one: _quote(one[1].evidence)),
-    Column("status", "Status", of=lambda one: one[1].submit.status),
-    Column("edit", "Edit", of=lambda one: getattr(one[1].transition, "edit", None)),
-    Column("changed_lines", "Changed lines", "integer", of=lambda one: one[1].submit.changed_lines),
-    Column("visible", "Visible mean", "number", of=lambda one: one[1].submit.mean_return),
-    Column("validation", "Validation mean", "number", of=lambda one: one[1].submit.val_mean),
-    Column(
-        "best", "New validation best", of=lambda one: (t := one[1].transition) and ("yes" if t.hit else "no")
-    ),
-    Column("selected", "Selected", of=lambda one: "yes" if one[1].submit is one[0].selected else None),
+    Column("env", "Environment", of=lambda one: title_of(one.run.env)),
+    Column("entry", "Agent", of="run.entry"),
+    Column("run", "Run", of=lambda one: _short(one.run.name)),
+    Column("submit", "Submit", of="each.submit.label"),
+    Column("before", "Budget before", "integer", of="each.submit.consumed_before"),
+    Column("after", "Budget after", "integer", of="each.submit.consumed"),
+    Column("read", "Evidence read", of=lambda one: ", ".join(getattr(one.each.evidence, "read", ())) or None),
+    Column("said", "The agent's own words", of=lambda one: _quote(one.each.evidence)),
+    Column("status", "Status", of="each.submit.status"),
+    Column("edit", "Edit", of="each.transition.edit"),
+    Column("changed_lines", "Changed lines", "integer", of="each.submit.changed_lines"),
+    Column("visible", "Visible mean", "number", of="each.submit.mean_return"),
+    Column("validation", "Validation mean", "number", of="each.submit.val_mean"),
+    Column("best", "New validation best", of=lambda one: (t := one.each.transition) and _YES_NO[t.hit]),
+    Column("selected", "Selected", of=lambda one: "yes" if one.each.submit is one.run.selected else None),
 )
 
 
 def submits_of(trace: Trace) -> list[dict[str, Any]]:
     """A run's rows of the table of feedback use."""
-    return rows_of([(trace.run, row) for row in trace.rows], _FEEDBACK)
+    return rows_of([_Of(trace.run, row) for row in trace.rows], _FEEDBACK)
 
 
 def _quote(evidence: Evidence | None) -> str:
@@ -227,18 +234,20 @@ def feedback_use(rows: Iterable[dict[str, Any]]) -> Table:
     return Table(
         name="feedback_use",
         title="Feedback use",
-        caption=(
-            "One row a submit: what the agent had read and said since the submit before, how the policy changed, and"
-            " what came of it. Budget: train episodes consumed before and after. Validation is hidden from agents."
-        ),
+        caption="One row a submit: what the agent had read and said since the submit before, how the policy"
+        " changed, and what came of it. Budget: train episodes consumed before and after. Validation is"
+        " hidden from agents.",
         columns=_FEEDBACK,
         rows=tuple(rows),
     )
 
 
-def _audit_row(signals: AuditSignals) -> dict[str, Any]:
-    run, record = signals.run, signals.run.record
-    selected = record.outcome.best_submit_index
+def _audit_row(run: Run) -> dict[str, Any]:
+    record, submits, selected = run.record, run.submits, run.record.outcome.best_submit_index
+    dimensions = record.experiment_dimensions
+    not_ok = sum(submit.status != "ok" for submit in submits)
+    compared = (*run.scored[:1], run.selected)
+    nodes = [each.source.features.nodes for each in compared if each and each.source]
 
     def recorded(value: Any) -> Any:
         return None if run.is_published else value
@@ -247,18 +256,18 @@ def _audit_row(signals: AuditSignals) -> dict[str, Any]:
         "run": _short(run.name),
         "entry": run.entry,
         "env": title_of(run.env),
-        "accepted": len(run.submits),
+        "accepted": len(submits),
         "rejected": recorded(len(record.rejected_submits)),
-        "not_ok": signals.not_ok,
-        "invalid_rate": signals.invalid_rate,
-        "repaired_rate": signals.repaired_rate,
+        "not_ok": not_ok,
+        "invalid_rate": not_ok / len(submits) if submits else None,
+        "repaired_rate": _repaired_rate(record.outcome.auxiliary.get("transitions")),
         "budget": run.budget,
-        "budget_used": run.submits[-1].consumed if run.submits else 0,
-        "episodes_per_submit": signals.episodes_per_submit,
-        "failed_episodes": signals.failed_episodes,
-        "score_drops": signals.score_drops,
+        "budget_used": submits[-1].consumed if submits else 0,
+        "episodes_per_submit": fmean(submit.n_episodes for submit in submits) if submits else None,
+        "failed_episodes": sum(submit.n_failed_episodes for submit in submits),
+        "score_drops": sum(transition.val_drop for transition in classify(submits)),
         "selected_index": selected,
-        "complexity_growth": signals.complexity_growth,
+        "complexity_growth": nodes[1] / nodes[0] if len(nodes) == 2 and nodes[0] else None,
         "retries": recorded(record.agent.retries),
         "turns": recorded(record.agent.turns),
         "wall_s": record.timing.wall_time_seconds,
@@ -266,8 +275,8 @@ def _audit_row(signals: AuditSignals) -> dict[str, Any]:
         "secret_splits": record.versions.data_secret,
         "jail": record.jail,
         "hidden_isolation": record.hidden_isolation,
-        "hidden_cases": record.experiment_dimensions.hidden_cases,
-        "simulation": record.experiment_dimensions.simulation,
+        "hidden_cases": dimensions.hidden_cases,
+        "simulation": dimensions.simulation,
         "simulator_flags": None if run.simulation_allowed else len(run.simulator_flags),
         "signals": len(run.signals),
         "selected": None if selected is None else f"s{selected:03d}",
@@ -275,19 +284,29 @@ def _audit_row(signals: AuditSignals) -> dict[str, Any]:
     }
 
 
-def _audit(study: Study) -> Table:
+def _repaired_rate(transitions: object) -> float | None:
+    """Share of train steps whose action was repaired; None if the run has no record of it."""
+    counts = transitions if isinstance(transitions, dict) else {}
+    steps, invalid = counts.get("steps"), counts.get("action_invalid")
+    if not isinstance(steps, int) or not isinstance(invalid, int) or not 0 <= invalid <= steps or not steps:
+        return None
+    return invalid / steps
+
+
+def _audit(runs: Iterable[Run]) -> Table:
+    """Diagnostics: no score depends on them. Runs of the published software record only some of them."""
     flags = "Places in its code that look like a simulator: a signal to read, never a verdict."
     repaired = "Share of the train steps whose action was outside the action space."
     splits = "`public`: of case files or a public seed that anybody may know."
+    looks = "Places in its log and code that deserve a look: no verdict."
     return Table(
         name="audit",
         title="Audit signals",
-        caption=(
-            "One row a run. Invalid submits: accepted ones that are not ok, of all accepted. Repaired actions: share of"
-            " the train steps whose action was outside the action space; a dash for runs of earlier versions. Score"
-            " drops: score-bearing submits whose validation mean is below the one before. Growth: AST nodes of the"
-            " selected policy over those of the first. Wall time by phase, in seconds; phases may overlap."
-        ),
+        caption="One row a run. Invalid submits: accepted ones that are not ok, of all accepted. Repaired"
+        " actions: share of the train steps whose action was outside the action space; a dash for runs of"
+        " earlier versions. Score drops: score-bearing submits whose validation mean is below the one before."
+        " Growth: AST nodes of the selected policy over those of the first. Wall time by phase, in seconds;"
+        " phases may overlap.",
         columns=(
             ENV,
             ENTRY,
@@ -307,19 +326,14 @@ def _audit(study: Study) -> Table:
             Column("splits", "Splits", note=splits),
             Column("simulation", "Simulation", note="Whether the run's rules let the agent simulate."),
             Column("simulator_flags", "Simulator flags", "integer", note=flags),
-            Column(
-                "signals",
-                "Signals",
-                "integer",
-                note="Places in its log and code that deserve a look: no verdict.",
-            ),
+            Column("signals", "Signals", "integer", note=looks),
             *(
                 Column(phase, f"{phase.removesuffix('_s').capitalize()} (s)", "number", digits=0)
                 for phase in ("wall_s", *PHASES)
             ),
         ),
-        rows=tuple(map(_audit_row, study.audit)),
-        runs=tuple(signals.run.name for signals in study.audit),
+        rows=tuple(map(_audit_row, runs)),
+        runs=tuple(run.name for run in runs),
     )
 
 
@@ -335,21 +349,21 @@ _SIGNALS = (
 )
 
 
-def _evidence(signals: list[tuple[Run, Signal]], name: str, title: str, caption: str) -> Table:
+def _evidence(name: str, title: str, signals: list[_Of], caption: str) -> Table:
     return tabulated(
-        signals,
+        name,
+        title,
         (
             *_FEEDBACK[:3],
-            Column("signal", "Signal", of=lambda one: TITLES[one[1].kind]),
-            Column("file", "File", of=lambda one: one[1].place),
-            Column("submits", "Submits", of=lambda one: submits_text(one[1].submits) or None),
-            Column("reason", "Why", of=lambda one: one[1].reason),
-            Column("quote", "Evidence", of=lambda one: one[1].quote[:_MAX_QUOTE]),
+            Column("signal", "Signal", of=lambda one: TITLES[one.each.kind]),
+            Column("file", "File", of="each.place"),
+            Column("submits", "Submits", of=lambda one: submits_text(one.each.submits) or None),
+            Column("reason", "Why", of="each.reason"),
+            Column("quote", "Evidence", of=lambda one: one.each.quote[:_MAX_QUOTE]),
         ),
-        run=lambda one: one[0].name,
-        name=name,
-        title=title,
-        caption=caption,
+        signals,
+        caption,
+        run=lambda one: one.run.name,
     )
 
 
@@ -364,44 +378,20 @@ def submits_text(indices: Iterable[int]) -> str:
     return ", ".join(f"s{a:03d}" if a == b else f"s{a:03d}–s{b:03d}" for a, b in spans)
 
 
-_MISSING: tuple[tuple[str, str, Callable[[Run], bool]], ...] = (
-    (
-        "Normalised performance",
-        "the random reference on the held-out cases",
-        lambda run: run.record.outcome.random_reference is None,
-    ),
+_REFERENCE, _VALIDATION = "record.outcome.random_reference", "record.outcome.val_scores"
+_MISSING = (
+    ("Normalised performance", "the random reference on the held-out cases", _REFERENCE),
     (
         "Score evolution",
         "the random reference: the scale begins at the lowest first score instead",
-        lambda run: run.record.outcome.random_reference is None,
+        _REFERENCE,
     ),
-    ("Score evolution", "validation means, so no curve", lambda run: not run.record.outcome.val_scores),
-    ("Edit types, edit size", "validation means, so no hits", lambda run: not run.record.outcome.val_scores),
-    (
-        "Realised structure",
-        "the selected policy's source",
-        lambda run: run.selected is None or run.selected.source is None,
-    ),
-    ("Tokens and cost", "tokens and cost", lambda run: run.record.agent.tokens is None),
-    ("Audit signals", "refused requests, turns, retries, the phases of the wall time", lambda run: True),
-    ("Agents", "harness, version, settings, jail, hidden isolation", lambda run: True),
-    ("Environments", "the bounds of a submit, the number of validation cases", lambda run: True),
+    ("Score evolution", "validation means, so no curve", _VALIDATION),
+    ("Edit types, edit size", "validation means, so no hits", _VALIDATION),
+    ("Realised structure", "the selected policy's source", "selected.source"),
+    ("Tokens and cost", "tokens and cost", "record.agent.tokens"),
+    ("Audit signals", "refused requests, turns, retries, the phases of the wall time", ""),
+    ("Agents", "harness, version, settings, jail, hidden isolation", ""),
+    ("Environments", "the bounds of a submit, the number of validation cases", ""),
 )
-"""Table, the information that it lacks for runs of the published software, and a test for affected runs."""
-
-
-def _missing(study: Study) -> Table:
-    """The information missing from the published software's run directories, by table."""
-    runs = [run for run in study.runs if run.is_published]
-    counts = [(table, what, sum(map(lacks, runs))) for table, what, lacks in _MISSING]
-    return tabulated(
-        [each for each in counts if each[2]],
-        (
-            Column("table", "Table", of=itemgetter(0)),
-            Column("what", "Missing value", of=itemgetter(1)),
-            Column("runs", "Runs", "integer", of=itemgetter(2)),
-        ),
-        name="not_told",
-        title="Missing values",
-        caption="Values that run directories of the published software lack, by table. They are left empty.",
-    )
+"""Table, the information that it lacks for runs of the published software, and its place in a run that may have it."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -10,38 +11,102 @@ from msgspec.structs import replace
 from evopolicy_common.statistics.distributions import ALPHA
 from evopolicy_results.reading.environments import title_of
 from evopolicy_results.statistics.aggregates import LEAST_RUNS, TAUS
-from evopolicy_results.statistics.pairs import Pair
-from evopolicy_results.statistics.repeats import MAX_REPEATS
-from evopolicy_results.statistics.resolution import GAPS
+from evopolicy_results.statistics.pairs import GAPS, MAX_REPEATS, Pair
 from evopolicy_results.statistics.starts import StartGroup
 from evopolicy_results.studies.study import Suite
 from evopolicy_results.tables.run_tables import ENTRY, ENV, RUNS
-from evopolicy_results.tables.table import Column, Table, interval_text, rows_of, tabulated
-
-_CHECKPOINTS = (
-    " With one run a cell this compares the selected checkpoints, not the agents: how an agent's runs vary is not"
-    " known."
+from evopolicy_results.tables.table import (
+    INTERVAL,
+    Column,
+    Table,
+    interval_text,
+    rows_of,
+    tabulated,
+    with_interval,
 )
+
 _SHOWN_TAUS = (0.1, 0.25, 0.5, 0.75, 0.9)
-ENVIRONMENTS = Column("environments", "Environments", "integer", of=lambda one: one.n_environments)
-INTERVAL = "95 % interval"
+ENVIRONMENTS = Column("environments", "Environments", "integer", of="n_environments")
 OVER = Column("over", "Over", note="What a repetition would draw anew: cases, runs, or runs and cases.")
 
 
 def statistics_tables(suite: Suite) -> list[Table]:
     """The tables in the order of the report; some may have no rows."""
+    results = suite.statistics
+    n_unpaired = sum(pair.n_left_out > 0 for pair in results.pairs)
     return [
-        _pairs(suite),
+        tabulated(
+            f"pairs_{suite.name}",
+            f"{suite.title} differences",
+            (ENV, *_PAIR),
+            results.pairs,
+            "Every two entries on every environment: first minus second, in held-out returns of the cases that both"
+            " have. Interval: 95 %, for one environment and pair alone, over what the column Over names. p: of no"
+            " difference, two-sided, from the interval's own distribution; it is at most 0.05 exactly if the interval"
+            " excludes 0. Corrected p: Holm, over all rows of this table together, so a false difference in any row has"
+            " a probability of at most 5 %. Significant: corrected p at most 0.05. About how many runs (or cases) would"
+            " be needed: so many that every second experiment resolves a true difference of the size seen here, whose"
+            " own size is uncertain. These cases only: permutation test that exchanges runs and takes the cases as"
+            " given; with other cases the difference may vanish, and no verdict rests on it. The tie groups of the"
+            " leaderboard are a second family of comparisons at 5 %, so both together have at most 10 %."
+            + checkpoints(suite)
+            + f" In {n_unpaired} rows the entries' cases differ: only common cases pair, and the others are left out."
+            * bool(n_unpaired),
+        ),
         _resolution(suite),
-        _aggregates(suite),
-        _improvements(suite),
+        tabulated(
+            f"aggregates_{suite.name}",
+            f"{suite.title} aggregates",
+            (
+                ENTRY,
+                Column("iqm", "IQM", "number", note="Interquartile mean.", of="iqm.value"),
+                Column("iqm_interval", INTERVAL, of=lambda one: interval_text(one.iqm, 2)),
+                *itertools.chain(*map(_above, _SHOWN_TAUS)),
+                ENVIRONMENTS,
+                RUNS,
+                Column("over", "Over", note="What the bootstrap draws anew."),
+            ),
+            results.aggregates,
+            "Over the normalised scores of single runs, not clipped, on the environments that have a random-to-best"
+            " scale (Agarwal et al. 2021). IQM: mean of the middle half. Above: share of the runs whose normalised"
+            " score is above it (the performance profile). Intervals: 95 %, percentiles of a bootstrap stratified by"
+            " environment, over what the column Over names; the scale is estimated again in each resample. The best"
+            " agent's observed mean is the scale's end; where several agents are about as good it is too high on"
+            " average, IQMs are too low, and their intervals miss: compare such agents by their differences. Two runs"
+            f" to {LEAST_RUNS - 1} are too few for the intervals of shares." + checkpoints(suite),
+        ),
+        tabulated(
+            f"improvement_{suite.name}",
+            f"{suite.title} probability of improvement",
+            (
+                *_PAIR[:2],
+                Column("probability", "Probability", "number", of="probability.value"),
+                Column("interval", INTERVAL, of=lambda one: interval_text(one.probability)),
+                ENVIRONMENTS,
+            ),
+            results.improvements,
+            "How probably a run of the first agent scores above a run of the second, ties counting half, mean over the"
+            " environments that have a scale (Agarwal et al. 2021). Interval: 95 %, stratified bootstrap over runs and"
+            " their cases, or over the cases of single runs." + checkpoints(suite),
+        ),
         _generalisation(suite),
     ]
 
 
+def _above(tau: float) -> tuple[Column, Column]:
+    place = TAUS.index(tau)
+    key = f"above_{tau:g}".replace(".", "_")
+    return with_interval(key, f"Above {tau:g}", lambda one: one.profile[place], 2)
+
+
 def checkpoints(suite: Suite) -> str:
     """A caption's sentence where an agent has one run on an environment; else empty."""
-    return _CHECKPOINTS if any(pair.compares == "checkpoints" for pair in suite.statistics.pairs) else ""
+    if all(pair.compares == "agents" for pair in suite.statistics.pairs):
+        return ""
+    return (
+        " With one run a cell this compares the selected checkpoints, not the agents: how an agent's runs vary is not"
+        " known."
+    )
 
 
 def _with_interval(field: str) -> Callable[[Pair], str | None]:
@@ -66,64 +131,26 @@ def _told_apart(pair: Pair) -> str | None:
     return f"{text}; more cases would be needed" if more_cases else text
 
 
+_BETTER = "The better entry, or the reason for none."
+_NEEDED = "Runs of each agent, or cases of checkpoints."
+_UNPAIRED = "Cases that only some of the runs have."
 _PAIR = (
     Column("first", "First"),
     Column("second", "Second"),
-    Column("gap", "Difference", "number", of=lambda pair: None if pair.gap is None else pair.gap.value),
+    Column("gap", "Difference", "number", of="gap.value"),
     Column("interval", INTERVAL, of=lambda pair: interval_text(pair.gap) or pair.reason or None),
     replace(OVER, of=_with_interval("over")),
     Column("method", "Method", of=_with_interval("method")),
     Column("p", "p", "number", digits=4, below=True),
     Column("p_holm", "Corrected p", "number", digits=4, below=True),
-    Column(
-        "told_apart",
-        "Significantly better",
-        note="The better entry, or the reason for none.",
-        of=_told_apart,
-    ),
-    Column(
-        "needed",
-        "Needed",
-        "integer",
-        note="Runs of each agent, or cases of checkpoints.",
-        of=lambda pair: pair.n_needed,
-    ),
+    Column("told_apart", "Significantly better", note=_BETTER, of=_told_apart),
+    Column("needed", "Needed", "integer", note=_NEEDED, of="n_needed"),
     Column("p_these_cases", "p, these cases only", "number", digits=4, below=True),
     Column("compares", "Compares", note="Checkpoints, where an entry has one run; else agents."),
     Column("runs", "Runs", of=lambda pair: "{} and {}".format(*pair.n_runs)),
     Column("cases", "Cases", "integer", of=lambda pair: pair.n_cases or None),
-    Column(
-        "left_out",
-        "Cases left out",
-        "integer",
-        note="Cases that only some of the runs have.",
-        of=lambda pair: pair.n_left_out,
-    ),
+    Column("left_out", "Cases left out", "integer", note=_UNPAIRED, of="n_left_out"),
 )
-
-
-def _pairs(suite: Suite) -> Table:
-    n_unpaired = sum(pair.n_left_out > 0 for pair in suite.statistics.pairs)
-    return tabulated(
-        suite.statistics.pairs,
-        (ENV, *_PAIR),
-        name=f"pairs_{suite.name}",
-        title=f"{suite.title} differences",
-        caption=(
-            "Every two entries on every environment: first minus second, in held-out returns of the cases that both"
-            " have. Interval: 95 %, for one environment and pair alone, over what the column Over names. p: of no"
-            " difference, two-sided, from the interval's own distribution; it is at most 0.05 exactly if the interval"
-            " excludes 0. Corrected p: Holm, over all rows of this table together, so a false difference in any row has"
-            " a probability of at most 5 %. Significant: corrected p at most 0.05. About how many runs (or cases) would"
-            " be needed: so many that every second experiment resolves a true difference of the size seen here, whose"
-            " own size is uncertain. These cases only: permutation test that exchanges runs and takes the cases as"
-            " given; with other cases the difference may vanish, and no verdict rests on it. The tie groups of the"
-            " leaderboard are a second family of comparisons at 5 %, so both together have at most 10 %."
-        )
-        + checkpoints(suite)
-        + f" In {n_unpaired} rows the entries' cases differ: only common cases pair, and the others are left out."
-        * bool(n_unpaired),
-    )
 
 
 def starts_table(groups: Sequence[StartGroup]) -> Table:
@@ -146,13 +173,12 @@ def starts_table(groups: Sequence[StartGroup]) -> Table:
     return Table(
         name="starts",
         title="Differences between runs from one state",
-        caption=(
-            "Runs that start from a submit of an earlier run, compared with those from the same submit: first minus"
-            " second, in held-out returns, paired by case, with the 95 % interval and Holm's correction over all pairs"
-            " from one state. They are on no leaderboard and in no other table of scores. Parent scored: the agent of"
-            " the earlier run, or of a run before it, had ended when one of these started, so a result may have chosen"
-            " the submit. The differences between runs from it stay valid; their level is not a score from scratch."
-        ),
+        caption="Runs that start from a submit of an earlier run, compared with those from the same submit:"
+        " first minus second, in held-out returns, paired by case, with the 95 % interval and Holm's"
+        " correction over all pairs from one state. They are on no leaderboard and in no other table of"
+        " scores. Parent scored: the agent of the earlier run, or of a run before it, had ended when one of"
+        " these started, so a result may have chosen the submit. The differences between runs from it stay"
+        " valid; their level is not a score from scratch.",
         columns=(ENV, Column("start", "From"), Column("scored", "Parent scored"), *kept),
         rows=tuple(rows),
     )
@@ -160,14 +186,14 @@ def starts_table(groups: Sequence[StartGroup]) -> Table:
 
 def _resolution(suite: Suite) -> Table:
     gap, whole = suite.statistics.standings.gap, suite.statistics.overall
-    rows = [*suite.statistics.resolutions, *([whole] if whole is not None else [])]
 
     def repeats(share: float) -> Column:
         key = f"repeats_{share:g}".replace(".", "_")
         return Column(key, f"Repeats for {share:g}", of=lambda one: (n := one.repeats(share)) and str(n))
 
     return tabulated(
-        rows,
+        f"resolution_{suite.name}",
+        f"{suite.title} resolution",
         (
             replace(ENV, of=lambda one: "Mean of all" if one is whole else title_of(one.env)),
             Column("gap", "Smallest difference", "number", of=lambda one: None if one is whole else one.gap),
@@ -176,77 +202,18 @@ def _resolution(suite: Suite) -> Table:
             Column("cases", "Cases", "integer", of=lambda one: one.n_cases or None),
             *map(repeats, GAPS),
         ),
-        name=f"resolution_{suite.name}",
-        title=f"{suite.title} resolution",
-        caption=(
-            "The smallest difference between two agents that these cases and runs resolve: the half width of its 95 %"
-            " interval, median over pairs, in returns and as a share of the random-to-best scale. A true difference of"
-            " that size is resolved every second time. Repeats: runs of each agent that a difference of that share of"
-            f' the scale would need; "more cases" where more runs do not help (up to {MAX_REPEATS} were tried); a'
-            " dash with one run a cell, which does not show how runs vary. Mean of all: of the normalised scores"
-            " over the environments, which are fixed."
-        )
+        [*suite.statistics.resolutions, *([whole] if whole is not None else [])],
+        "The smallest difference between two agents that these cases and runs resolve: the half width of its 95 %"
+        " interval, median over pairs, in returns and as a share of the random-to-best scale. A true difference of"
+        " that size is resolved every second time. Repeats: runs of each agent that a difference of that share of"
+        f' the scale would need; "more cases" where more runs do not help (up to {MAX_REPEATS} were tried); a'
+        " dash with one run a cell, which does not show how runs vary. Mean of all: of the normalised scores"
+        " over the environments, which are fixed."
         + (
             ""
             if gap is None
             else f" Of the suite's rank score, a difference of {gap:.3f} is the smallest that is resolved."
         ),
-    )
-
-
-def _aggregates(suite: Suite) -> Table:
-    def above(tau: float) -> tuple[Column, Column]:
-        key, place = f"above_{tau:g}".replace(".", "_"), TAUS.index(tau)
-        return (
-            Column(key, f"Above {tau:g}", "number", digits=2, of=lambda one: one.profile[place].value),
-            Column(f"{key}_interval", INTERVAL, of=lambda one: interval_text(one.profile[place], 2)),
-        )
-
-    return tabulated(
-        suite.statistics.aggregates,
-        (
-            ENTRY,
-            Column(
-                "iqm", "IQM", "number", note="Interquartile mean.", of=lambda one: one.iqm and one.iqm.value
-            ),
-            Column("iqm_interval", INTERVAL, of=lambda one: interval_text(one.iqm, 2)),
-            *(column for tau in _SHOWN_TAUS for column in above(tau)),
-            ENVIRONMENTS,
-            RUNS,
-            Column("over", "Over", note="What the bootstrap draws anew."),
-        ),
-        name=f"aggregates_{suite.name}",
-        title=f"{suite.title} aggregates",
-        caption=(
-            "Over the normalised scores of single runs, not clipped, on the environments that have a random-to-best"
-            " scale (Agarwal et al. 2021). IQM: mean of the middle half. Above: share of the runs whose normalised"
-            " score is above it (the performance profile). Intervals: 95 %, percentiles of a bootstrap stratified by"
-            " environment, over what the column Over names; the scale is estimated again in each resample. The best"
-            " agent's observed mean is the scale's end; where several agents are about as good it is too high on"
-            " average, IQMs are too low, and their intervals miss: compare such agents by their differences. Two runs"
-            f" to {LEAST_RUNS - 1} are too few for the intervals of shares."
-        )
-        + checkpoints(suite),
-    )
-
-
-def _improvements(suite: Suite) -> Table:
-    return tabulated(
-        suite.statistics.improvements,
-        (
-            *_PAIR[:2],
-            Column("probability", "Probability", "number", of=lambda one: one.probability.value),
-            Column("interval", INTERVAL, of=lambda one: interval_text(one.probability)),
-            ENVIRONMENTS,
-        ),
-        name=f"improvement_{suite.name}",
-        title=f"{suite.title} probability of improvement",
-        caption=(
-            "How probably a run of the first agent scores above a run of the second, ties counting half, mean over the"
-            " environments that have a scale (Agarwal et al. 2021). Interval: 95 %, stratified bootstrap over runs and"
-            " their cases, or over the cases of single runs."
-        )
-        + checkpoints(suite),
     )
 
 
@@ -276,14 +243,13 @@ def _generalisation(suite: Suite) -> Table:
     return Table(
         name=f"generalisation_{suite.name}",
         title=f"{suite.title} generalisation",
-        caption=(
-            "Mean return of the selected checkpoint on its own submit's train episodes, on validation, and on held-out"
-            " cases; means over completed runs. Optimism: validation minus held-out. Selection takes the best of many"
-            " validation scores, so it is above 0 on average even where an agent fits nothing. Normalised: as a share"
-            " of the random-to-best scale; its last rows are means over environments with a 95 % t interval whose unit"
-            " is the environment. Success: share of held-out episodes that reached the goal, where the environment"
-            " reports it (Fetch, parking), or the return tells it exactly (MiniGrid, Acrobot, continuous MountainCar)."
-        ),
+        caption="Mean return of the selected checkpoint on its own submit's train episodes, on validation,"
+        " and on held-out cases; means over completed runs. Optimism: validation minus held-out. Selection"
+        " takes the best of many validation scores, so it is above 0 on average even where an agent fits"
+        " nothing. Normalised: as a share of the random-to-best scale; its last rows are means over"
+        " environments with a 95 % t interval whose unit is the environment. Success: share of held-out"
+        " episodes that reached the goal, where the environment reports it (Fetch, parking), or the return"
+        " tells it exactly (MiniGrid, Acrobot, continuous MountainCar).",
         columns=columns,
         rows=tuple(rows),
     )

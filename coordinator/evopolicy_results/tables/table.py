@@ -19,8 +19,16 @@ from evopolicy_common.terminal import csv_cell, one_line
 from evopolicy_results.statistics.aggregates import Bounded
 
 Kind = Literal["text", "integer", "number", "percent"]
+INTERVAL = "95 % interval"
 DASH = "–"
 """Shown for a missing value; CSV leaves the field empty."""
+
+
+def at(record: Any, path: str) -> Any:
+    """The attribute of a record at a path such as `gap.value`; None if an attribute on the way is None."""
+    for name in path.split("."):
+        record = None if record is None else getattr(record, name)
+    return record
 
 
 class Column(msgspec.Struct, frozen=True):
@@ -36,8 +44,12 @@ class Column(msgspec.Struct, frozen=True):
     """Whether a `number` above 0 but below its last decimal is shown as such (`<0.01`) instead of as 0."""
     note: str = ""
     """One-sentence explanation, shown on demand."""
-    of: Callable[[Any], Any] | None = None
-    """Its value in a record; default: the record's attribute `key`."""
+    of: Callable[[Any], Any] | str = ""
+    """Its value in a record: a function, or a path of attributes (`at`); default: `key`."""
+
+    def value(self, record: Any) -> Any:
+        """The value in a record."""
+        return self.of(record) if callable(self.of) else at(record, self.of or self.key)
 
 
 class Table(msgspec.Struct, frozen=True, kw_only=True):
@@ -57,19 +69,16 @@ class Table(msgspec.Struct, frozen=True, kw_only=True):
 
 def rows_of(records: Iterable[Any], columns: Sequence[Column]) -> list[dict[str, Any]]:
     """A row a record."""
-    return [
-        {column.key: column.of(each) if column.of else getattr(each, column.key) for column in columns}
-        for each in records
-    ]
+    return [{column.key: column.value(each) for column in columns} for each in records]
 
 
 def tabulated(
-    records: Iterable[Any],
-    columns: Sequence[Column],
-    *,
     name: str,
     title: str,
+    columns: Sequence[Column],
+    records: Iterable[Any],
     caption: str,
+    *,
     run: Callable[[Any], str] | None = None,
 ) -> Table:
     """A row a record. `run`: the name of the run that a record is about."""
@@ -81,6 +90,16 @@ def tabulated(
         columns=tuple(columns),
         rows=tuple(rows_of(records, columns)),
         runs=tuple(map(run, records)) if run is not None else (),
+    )
+
+
+def with_interval(
+    key: str, title: str, of: Callable[[Any], Estimate | Bounded], digits: int
+) -> tuple[Column, Column]:
+    """Columns of an estimate's value and of its interval."""
+    return (
+        Column(key, title, "number", digits=digits, of=lambda each: of(each).value),
+        Column(f"{key}_interval", INTERVAL, of=lambda each: interval_text(of(each), digits)),
     )
 
 
@@ -116,8 +135,7 @@ def shown(value: Any, column: Column) -> str:
 
 
 def to_csv(table: Table) -> str:
-    """Header of column keys; unrounded numbers; missing values empty; an apostrophe before texts that look like
-    formulas."""
+    """Header of column keys; unrounded numbers; missing values empty; an apostrophe before formulas."""
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
     writer.writerow([csv_cell(column.key) for column in table.columns])  # may be names of agents
@@ -152,8 +170,7 @@ def _pipe(text: str) -> str:
 
 
 def best_marks(rows: Sequence[dict[str, Any]], keys: Sequence[str]) -> dict[tuple[int, str], int]:
-    """Marks 1 and 2 for the highest and second-highest value of each column; equal values share a mark, as with
-    ranks."""
+    """Marks 1 and 2 for the highest and second-highest value of each column; equal values share a mark."""
     marks: dict[tuple[int, str], int] = {}
     for key in keys:
         values = {i: row[key] for i, row in enumerate(rows) if row.get(key) is not None}

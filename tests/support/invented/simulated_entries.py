@@ -16,11 +16,9 @@ from numpy.typing import NDArray
 from evopolicy_common.statistics.distributions import t_quantile
 from evopolicy_common.statistics.intervals import Estimate, difference, mean, of_runs
 from evopolicy_common.statistics.resampling import RESAMPLES
-from evopolicy_results.scoring.normalised import Scale
+from evopolicy_results.scoring.scores import Cell, RunReturns, Scale
 from evopolicy_results.statistics.aggregates import Bounded, aggregates
-from evopolicy_results.statistics.pairs import pairs
-from evopolicy_results.statistics.repeats import Spread, repeats_needed, standard_error
-from evopolicy_results.statistics.samples import RunReturns, Sample
+from evopolicy_results.statistics.pairs import Spread, pairs, repeats_needed, standard_error
 from evopolicy_results.statistics.standings import standings
 
 Floats = NDArray[np.float64]
@@ -230,10 +228,10 @@ class World(msgspec.Struct, frozen=True, kw_only=True):
         return found
 
 
-def suite_samples(returns: Mapping[tuple[str, str], Floats]) -> dict[tuple[str, str], Sample]:
+def suite_samples(returns: Mapping[tuple[str, str], Floats]) -> dict[tuple[str, str], Cell]:
     """Samples of matrices runs × cases; runs of an environment share its cases."""
     return {
-        (entry, env): Sample(
+        (entry, env): Cell(
             entry=entry,
             env=env,
             runs=tuple(
@@ -278,7 +276,7 @@ def false_gaps(world: World, trials: int, *, seed: int = 0) -> FalseGaps:
     return FalseGaps(rated(raw), rated(wrong), rated(split))
 
 
-def observed_scores(world: World, samples: Mapping[tuple[str, str], Sample]) -> dict[str, float]:
+def observed_scores(world: World, samples: Mapping[tuple[str, str], Cell]) -> dict[str, float]:
     """Rank scores by entry."""
     means = [[np.mean(samples[name, env].scores or ()) for name in world.names] for env in world.environments]
     return dict(zip(world.names, rank_scores(np.array(means)).tolist(), strict=True))
@@ -384,7 +382,7 @@ def aggregate_rates(
         for env in world.environments:
             reference = g.normal(0, 0.5, (1, world.n_cases))
             (fixed,) = suite_samples({("R", env): reference}).values()
-            samples["R", env] = msgspec.structs.replace(fixed, is_fixed=True)
+            samples["R", env] = msgspec.structs.replace(fixed, fixed=fixed.mean)
             scales[env] = Scale(
                 random=float(np.mean(fixed.scores or ())),
                 best=max(float(np.mean(samples[name, env].scores or ())) for name in world.names),

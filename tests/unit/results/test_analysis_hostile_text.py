@@ -15,6 +15,7 @@ from invented.policies import Version, policy
 from invented.run_dirs import write_run
 
 from evopolicy_results import report as writing
+from evopolicy_results.behaviour.trace import Trace
 from evopolicy_results.code import line_diff
 from evopolicy_results.code.line_diff import n_changed, unified
 from evopolicy_results.code.sources import parse, reachable_modules
@@ -69,7 +70,7 @@ def test_an_unforeseen_failure_spoils_one_page_alone(tmp_path: Path, monkeypatch
     write_run(tmp_path / "runs", VERSIONS, entry="Honest")
     real = writing.trace
 
-    def fails(run: writing.Run) -> writing.Trace:
+    def fails(run: writing.Run) -> Trace:
         if run.entry == "Hostile":
             raise ArithmeticError("<b>unforeseen</b>")
         return real(run)

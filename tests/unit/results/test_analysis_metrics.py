@@ -11,12 +11,11 @@ from invented.policies import Version, policy
 from invented.run_dirs import write_run
 
 from evopolicy_common.records.run_record import Tokens
-from evopolicy_results.behaviour.audit import audit_signals, mean_phases, token_use
-from evopolicy_results.behaviour.edits import classify, edit_rates
-from evopolicy_results.behaviour.structure import edit_size_bins, structure_means
+from evopolicy_results.behaviour.audit import mean_phases, token_use
+from evopolicy_results.behaviour.edits import classify, edit_rates, edit_size_bins, structure_means
 from evopolicy_results.reading.reader import load_runs, read_run
 from evopolicy_results.scoring.evolution import CurvePoint, area, best_at, episodes_to
-from evopolicy_results.scoring.scores import RANDOM_ENTRY, references, score_table
+from evopolicy_results.scoring.scores import RANDOM_ENTRY, Scale, references, score_table
 from evopolicy_results.studies.study import study_of
 from evopolicy_results.tables.report_tables import tables_of
 
@@ -103,8 +102,8 @@ def test_evolution_without_a_scale_has_no_area(tmp_path: Path) -> None:
     write_run(tmp_path, VERSIONS[:1], random_mean=50.0)
     (only,) = study_of(load_runs([tmp_path]).runs).evolutions
     assert (only.area, only.to_50) == (None, None)
-    assert area((), 10, None, None) is None
-    assert episodes_to((), 0.5, 0.0, 1.0) is None
+    assert area((), 10, None) is None
+    assert episodes_to((), 0.5, Scale(random=0.0, best=1.0)) is None
 
 
 def test_curve_is_a_step_function_of_the_consumed_budget() -> None:
@@ -149,14 +148,12 @@ def test_edit_sizes_are_binned_with_unchanged_bundles_apart(tmp_path: Path) -> N
 
 def test_audit_signals_of_a_run_are_as_counted_by_hand(tmp_path: Path) -> None:
     run = read_run(write_run(tmp_path, VERSIONS, rejected=3))
-    signals = audit_signals(run)
-    assert signals.not_ok == 1
-    assert signals.invalid_rate == pytest.approx(1 / 9)
-    assert signals.episodes_per_submit == pytest.approx(66 / 9)
-    assert (signals.score_drops, signals.failed_episodes) == (2, 0)
-    assert signals.complexity_growth > 1.0
     (row,) = next(table for table in tables_of(study_of([run])) if table.name == "audit").rows
     assert (row["accepted"], row["rejected"], row["budget_used"], row["budget"]) == (9, 3, 8 * 8 + 2, 128)
+    assert (row["not_ok"], row["score_drops"], row["failed_episodes"]) == (1, 2, 0)
+    assert row["invalid_rate"] == pytest.approx(1 / 9)
+    assert row["episodes_per_submit"] == pytest.approx(66 / 9)
+    assert row["complexity_growth"] > 1.0
     assert (row["selected"], row["turns"], row["retries"]) == ("s008", 9, 0)
     phases = {"agent_s": 60.0 * 9, "queue_s": 1.5 * 9, "rollout_s": 16.0 * 9, "feedback_s": 2.5 * 9}
     assert mean_phases([run]) == {run.entry: {**phases, "finalise_s": 90.0}}
@@ -240,5 +237,5 @@ def test_area_is_between_nought_and_the_final_level(levels: list[int], width: in
         steps.append(
             CurvePoint(index=i, consumed=(i + 1) * width, val_mean=float(level), best=best, improved=improved)
         )
-    value = area(steps, len(levels) * width, 0.0, 20.0)
+    value = area(steps, len(levels) * width, Scale(random=0.0, best=20.0))
     assert 0.0 <= value <= best / 20.0

@@ -10,9 +10,17 @@ from hypothesis import strategies as st
 
 from evopolicy_common.errors import ConfigError
 from evopolicy_results.scoring import paper
-from evopolicy_results.scoring.normalised import normalise, normalised
-from evopolicy_results.scoring.ranking import competition_ranks, leaderboard, rank_score
-from evopolicy_results.scoring.scores import Cell, ScoreTable, read_score_csv
+from evopolicy_results.scoring.scores import (
+    Cell,
+    RunReturns,
+    ScoreTable,
+    competition_ranks,
+    leaderboard,
+    normalised,
+    rank_score,
+    read_score_csv,
+    scale_between,
+)
 
 ENVS = ("gym/acrobot", "gym/racing", "gym/ant5")
 FAMILIES = ("gym_box2d", "mujoco", "minigrid", "robotics_driving")
@@ -20,7 +28,7 @@ FAMILIES = ("gym_box2d", "mujoco", "minigrid", "robotics_driving")
 
 def table(scores: dict[str, dict[str, tuple[float | None, ...]]], reference: str | None = None) -> ScoreTable:
     cells = {
-        (e, env): Cell(entry=e, env=env, scores=runs)
+        (e, env): Cell(entry=e, env=env, runs=tuple(RunReturns(score=score) for score in runs))
         for e, row in scores.items()
         for env, runs in row.items()
     }
@@ -46,10 +54,8 @@ def test_paper_table_of_returns_gives_its_normalised_table_to_two_decimals() -> 
     groups = {(group.entry, group.demand): group for group in result.groups}
     for row in paper.rows("normalised_performance"):
         for entry in table.agents:
-            if row["env"] == "mean":
-                value = groups[entry, row["demand"]].value
-            else:
-                value = result.cells[entry, row["env"]].value
+            of_env, of_group = (entry, row["env"]), (entry, row["demand"])
+            value = groups[of_group].value if row["env"] == "mean" else result.cells[of_env]
             assert value is not None
             assert f"{value:.2f}" == row[entry], (row["env"], entry)
     assert groups["GPT-5.5", "synthesis"].n_environments == 5
@@ -128,17 +134,15 @@ def test_repeats_give_their_mean() -> None:
 
 
 def test_normalisation_clips_and_has_no_scale_where_nothing_beats_random() -> None:
-    assert normalise(5.0, 0.0, 10.0) == 0.5
-    assert normalise(-5.0, 0.0, 10.0) == 0.0
-    assert normalise(1.0, 2.0, 2.0) is None
-    assert normalise(1.0, 3.0, 2.0) is None
-    assert normalise(None, 0.0, 1.0) is None
-    assert normalise(1.0, None, 1.0) is None
+    scale = scale_between(0.0, 10.0)
+    assert scale is not None
+    assert [scale.clipped(score) for score in (5.0, -5.0, 15.0)] == [0.5, 0.0, 1.0]
+    assert {scale_between(*ends) for ends in ((2.0, 2.0), (3.0, 2.0), (None, 1.0), (0.0, None))} == {None}
 
 
 def test_best_of_the_scale_is_an_agent_never_the_reference() -> None:
     result = normalised(table({"A": {"gym/ant5": (1.0,)}, "R": {"gym/ant5": (2.0,)}}, reference="R"))
-    assert result.cells["A", "gym/ant5"].value is None
+    assert result.cells["A", "gym/ant5"] is None
     assert ("R", "gym/ant5") not in result.cells
 
 

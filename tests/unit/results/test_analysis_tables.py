@@ -142,7 +142,7 @@ def test_timelines_have_a_row_for_each_run_up_to_their_limit(tmp_path: Path) -> 
     versions = [Version(policy(gain=float(i)), (0.0,) * 4, 1.0 + i % 2) for i in range(3)]
     for repeat in range(MAX_ROWS + 2):
         write_run(tmp_path, versions, entry="<A & B>", repeat=repeat, budget=16)
-    (plot,) = [each for each in figures_of(study([tmp_path])) if each.group == "timelines"]
+    (plot,) = [each for each in figures_of(study([tmp_path])) if each.name.startswith("timeline_")]
     svg = ElementTree.fromstring(plot.svg)
     texts = [element.text or "" for element in svg.iter("{http://www.w3.org/2000/svg}text")]
     assert (

@@ -22,11 +22,18 @@ from invented.study import write_suite
 from evopolicy_common.statistics.distributions import holm
 from evopolicy_common.statistics.intervals import TOO_FEW_CASES
 from evopolicy_results.notebook import figures_of, tables_of
-from evopolicy_results.scoring.normalised import Scale
 from evopolicy_results.scoring.paper import heldout_returns
+from evopolicy_results.scoring.scores import Cell, RunReturns, Scale
 from evopolicy_results.statistics.aggregates import NO_SCALE, Aggregate, aggregates
-from evopolicy_results.statistics.pairs import NO_COMMON_CASES, NO_RETURNS, NO_SCORE, Pair, cell_mean, pairs
-from evopolicy_results.statistics.samples import RunReturns, Sample, matched
+from evopolicy_results.statistics.pairs import (
+    NO_COMMON_CASES,
+    NO_RETURNS,
+    NO_SCORE,
+    Pair,
+    cell_mean,
+    matched,
+    pairs,
+)
 from evopolicy_results.statistics.standings import Standings, standings
 from evopolicy_results.studies.study import study, study_of
 from evopolicy_results.tables.latex import to_latex
@@ -40,15 +47,15 @@ def run(*returns: float, case_set: str = "cases", score: float | None = math.nan
     return RunReturns(score=expected, returns=returns, case_set=case_set)
 
 
-def entry(name: str, *runs: RunReturns, env: str = "env", is_fixed: bool = False) -> Sample:
-    return Sample(entry=name, env=env, runs=runs, is_fixed=is_fixed)
+def entry(name: str, *runs: RunReturns, env: str = "env", is_fixed: bool = False) -> Cell:
+    return Cell(entry=name, env=env, runs=runs, fixed=runs[0].score if is_fixed else None)
 
 
-def together(*entries: Sample) -> dict[tuple[str, str], Sample]:
+def together(*entries: Cell) -> dict[tuple[str, str], Cell]:
     return {(one.entry, one.env): one for one in entries}
 
 
-def pair_of(first: Sample, second: Sample) -> Pair:
+def pair_of(first: Cell, second: Cell) -> Pair:
     (found,) = pairs(together(first, second), [first.entry, second.entry], ["env"])
     return found
 
@@ -57,7 +64,7 @@ def rising(n: int, shift: float = 0.0) -> tuple[float, ...]:
     return tuple(float(i) + shift + 0.1 * math.sin(7.0 * i + shift) for i in range(n))
 
 
-def repeated(name: str, n: int, shift: float, step: float = 1.0) -> Sample:
+def repeated(name: str, n: int, shift: float, step: float = 1.0) -> Cell:
     """An entry of n runs, each `step` above the one before."""
     return entry(name, *(run(*rising(32, shift + step * r)) for r in range(n)))
 
@@ -142,7 +149,7 @@ def test_a_run_without_an_ok_submit_has_no_gap_and_stays_last() -> None:
 def test_scores_alone_have_no_interval_and_do_not_tie() -> None:
     samples = together(*(entry(name, RunReturns(score=score)) for name, score in (("A", 1.0), ("B", 2.0))))
     assert pairs(samples, ["A", "B"], ["env"])[0].reason == NO_RETURNS
-    assert standings(samples, {"A": 0.0, "B": 1.0}, ["env"]) == Standings(rows=(), gap=None, over="")
+    assert standings(samples, {"A": 0.0, "B": 1.0}, ["env"]) == Standings()
 
 
 def test_an_aggregate_without_spread_says_so_instead_of_a_zero_width() -> None:
@@ -154,7 +161,7 @@ def test_an_aggregate_without_spread_says_so_instead_of_a_zero_width() -> None:
     assert (found.iqm.value, found.iqm.low) == (1.0, None)
 
 
-def aggregated(a: Sample, b: Sample, reference: Sample, best: Sample) -> list[Aggregate]:
+def aggregated(a: Cell, b: Cell, reference: Cell, best: Cell) -> list[Aggregate]:
     """Of A and B, on the scale from the reference's mean to that of the best."""
     scale = Scale(random=float(np.mean(reference.scores)), best=float(np.mean(best.scores)))
     return aggregates(together(a, b, reference), ["A", "B"], {"env": scale})[0]
@@ -422,9 +429,8 @@ def test_rate_of_repaired_actions_is_reported_where_it_was_recorded(
 ) -> None:
     change = {"outcome": {"auxiliary": {"transitions": ... if repaired is None else repaired}}}
     write_run(tmp_path / "runs", VERSIONS, change=change)
-    found = study([tmp_path / "runs"])
-    assert found.audit[0].repaired_rate == rate
-    assert [row.get("repaired_rate") for row in table_named(tables_of(found), "audit").rows] == [rate]
+    tables = tables_of(study([tmp_path / "runs"]))
+    assert [row.get("repaired_rate") for row in table_named(tables, "audit").rows] == [rate]
 
 
 def test_selection_optimism_is_validation_minus_heldout(tmp_path: Path) -> None:

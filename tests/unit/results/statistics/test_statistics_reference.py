@@ -11,19 +11,17 @@ from invented.simulated_entries import half_width
 
 from evopolicy_common.statistics.distributions import holm, t_quantile
 from evopolicy_common.statistics.intervals import difference, of_runs, over_cases
-from evopolicy_results.scoring.normalised import Scale
+from evopolicy_results.scoring.scores import Cell, RunReturns, Scale
 from evopolicy_results.statistics.aggregates import TAUS, aggregates, iqm, probability_of_improvement, profile
-from evopolicy_results.statistics.pairs import label_test
-from evopolicy_results.statistics.repeats import Spread, repeats_needed
-from evopolicy_results.statistics.samples import RunReturns, Sample
+from evopolicy_results.statistics.pairs import Spread, label_test, repeats_needed
 
 A = np.array([[0.1, 0.9, 0.35], [0.2, 0.7, 0.5], [0.15, 1.1, 0.45], [0.05, 0.8, 0.65], [0.3, 0.95, 0.2]])
 B = np.array([[0.12, 0.6, 0.55], [0.25, 0.65, 0.5], [0.1, 0.75, 0.7], [0.2, 0.85, 0.4]])
 """Normalised scores, runs × environments."""
 
 
-def sample(entry: str, env: str, scores: np.ndarray) -> Sample:
-    return Sample(entry=entry, env=env, runs=tuple(RunReturns(score=float(score)) for score in scores))
+def sample(entry: str, env: str, scores: np.ndarray) -> Cell:
+    return Cell(entry=entry, env=env, runs=tuple(RunReturns(score=float(score)) for score in scores))
 
 
 def test_iqm_profile_and_improvement_are_those_of_rliable() -> None:
