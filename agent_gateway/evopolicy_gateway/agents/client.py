@@ -68,13 +68,16 @@ class Client:
 
     @classmethod
     def from_environment(cls) -> Client:
-        """A client for the URLs in the `EVOPOLICYGYM_*` variables. Raises KeyError when one is missing."""
-        return cls(
-            info_url=os.environ["EVOPOLICYGYM_INFO_URL"],
-            task_url=os.environ["EVOPOLICYGYM_TASK_URL"],
-            submit_url=os.environ["EVOPOLICYGYM_SUBMIT_URL"],
-            token=os.environ.get("EVOPOLICYGYM_TOKEN", ""),
-        )
+        """A client for the URLs in the `EVOPOLICYGYM_*` variables. Raises ProtocolError when one is missing."""
+        try:
+            return cls(
+                info_url=os.environ["EVOPOLICYGYM_INFO_URL"],
+                task_url=os.environ["EVOPOLICYGYM_TASK_URL"],
+                submit_url=os.environ["EVOPOLICYGYM_SUBMIT_URL"],
+                token=os.environ.get("EVOPOLICYGYM_TOKEN", ""),
+            )
+        except KeyError as error:
+            raise ProtocolError(f"{error} is not set; it is started by a gateway") from None
 
     def info(self) -> dict[str, Any]:
         """The present content of `/info`."""
@@ -100,16 +103,10 @@ class Client:
             self.sleep(self.poll_s)
         if status in (400, 409):
             refusal = self._json(answer)
-            error = refusal.get("error") or {}
-            return Refusal(
-                status=str(refusal.get("status", "refused")), message=str(error.get("message", ""))
-            )
+            message = (refusal.get("error") or {}).get("message", "")
+            return Refusal(status=str(refusal.get("status", "refused")), message=str(message))
         reply = self._expect_json(status, answer)
-        return self._await(reply)
-
-    def _await(self, reply: dict[str, Any]) -> Verdict:
-        wait_s = self.poll_s
-        index = int(reply["submit_id"])
+        wait_s, index = self.poll_s, int(reply["submit_id"])
         while reply.get("summary") is None:
             self.sleep(wait_s)
             wait_s = min(wait_s * 1.2, 8 * self.poll_s)

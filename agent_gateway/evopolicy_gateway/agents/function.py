@@ -12,7 +12,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, NoReturn
 
-from evopolicy_gateway.agents.client import Client, ProtocolError, Refusal
+from evopolicy_gateway.agents.client import Client, Refusal, exit_after
 
 RESULT = "result.json"
 
@@ -89,17 +89,20 @@ def main() -> None:
         function = cloudpickle.loads(Path(sys.argv[1]).read_bytes())
     except ModuleNotFoundError as error:
         _fail(f"{error}: in the jail there are the standard library, numpy and the function's own code")
-    workspace = Workspace(Client.from_environment(), Path.cwd())
-    try:
+
+    def play(client: Client) -> int:
+        workspace = Workspace(client, Path.cwd())
         value = function(workspace)
-    except ProtocolError as error:
-        _fail(str(error))
-    try:
-        text = json.dumps(value)
-    except (TypeError, ValueError) as error:
-        _fail(f"the function's value is not JSON ({error}); return numbers, texts, lists and dicts of them")
-    (Path.cwd() / RESULT).write_text(text, encoding="utf-8")
-    raise SystemExit(0 if workspace.n_submits else 1)
+        try:
+            text = json.dumps(value)
+        except (TypeError, ValueError) as error:
+            _fail(
+                f"the function's value is not JSON ({error}); return numbers, texts, lists and dicts of them"
+            )
+        (workspace.folder / RESULT).write_text(text, encoding="utf-8")
+        return workspace.n_submits
+
+    exit_after("function", play)
 
 
 if __name__ == "__main__":

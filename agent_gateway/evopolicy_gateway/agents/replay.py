@@ -25,18 +25,15 @@ METADATA = frozenset({"_meta.json", "metrics.json"})
 
 def policies_in(folder: Path) -> list[Path]:
     """Folders of the policies in `folder`, in the order of their submits."""
-    itself = _policy(folder)
-    if itself is not None:
-        return [itself]
-    policies = (_policy(child) for child in sorted(folder.iterdir()) if child.is_dir())
-    return [policy for policy in policies if policy is not None]
+    return _policy(folder) or [
+        policy for child in sorted(folder.iterdir()) if child.is_dir() for policy in _policy(child)
+    ]
 
 
 def folder_for(folder: Path, env: str) -> Path:
     """The subfolder of `folder` for this environment, or else for the one that it alters, or else for their family
     (the name up to the first hyphen), or else `folder` itself."""
-    each = (env, re.sub("@w[0-9]+$", "", env))
-    names = [name for one in each for name in (re.sub("[/:]", "_", one), one.replace("/", "_"))]
+    names = [re.sub(odd, "_", one) for one in (env, re.sub("@w[0-9]+$", "", env)) for odd in ("[/:]", "/")]
     named = (folder / name for name in (*names, names[0].partition("-")[0]))
     return next((own for own in named if own.is_dir()), folder)
 
@@ -49,9 +46,7 @@ def shares(budget: int, n_policies: int, least: int, most: int) -> list[int]:
     """
     least = max(1, least)
     n_played = min(n_policies, budget // least)
-    if n_played == 0:
-        return []
-    even, more = divmod(budget, n_played)
+    even, more = divmod(budget, max(n_played, 1))
     return [min(most, even + (index < more)) for index in range(n_played)]
 
 
@@ -112,11 +107,10 @@ def play(client: Client, folder: Path, workspace: Path) -> int:
     return n_taken
 
 
-def _policy(folder: Path) -> Path | None:
-    for candidate in (folder, folder / "system"):
-        if os.path.lexists(candidate / "policy.py"):
-            return candidate
-    return None
+def _policy(folder: Path) -> list[Path]:
+    """The policy that a folder is or holds; none for any other folder."""
+    places = (folder, folder / "system")
+    return [place for place in places if os.path.lexists(place / "policy.py")][:1]
 
 
 def main() -> None:

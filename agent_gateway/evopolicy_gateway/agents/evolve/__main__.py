@@ -1,5 +1,3 @@
-import sys
-
 from evopolicy_gateway.agents.evolve.agent import main
 
-sys.exit(main())
+main()

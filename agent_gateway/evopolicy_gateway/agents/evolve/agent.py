@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
 import shutil
-import sys
 from collections.abc import Sequence
-from importlib import resources
 from pathlib import Path
+from typing import NoReturn
 
 import numpy as np
 
-from evopolicy_gateway.agents.client import Client, ProtocolError, Refusal, Verdict
+from evopolicy_gateway.agents.client import Client, ProtocolError, Refusal, Verdict, exit_after
 from evopolicy_gateway.agents.evolve.evolved.grids import find_grid
 from evopolicy_gateway.agents.evolve.evolved.policy import CANDIDATES_FILE
 from evopolicy_gateway.agents.evolve.evolved.spaces import Schema, goal_keys
@@ -39,17 +39,18 @@ class Agent:
         spaces = meta["obs_space"], meta["action_space"]
         self._n_cases = int(meta["n_env_instances"])
         self._budget = int(info["state"]["remaining_budget"])
-        self._bounds = int(info["min_episodes_per_submit"]), int(info["max_episodes_per_submit"])
+        self._least, self._most = (int(info[f"{bound}_episodes_per_submit"]) for bound in ("min", "max"))
         self._search = Search(families_for(*spaces), np.random.default_rng(seed))
         self._next_case = 0
         self._lessons = Lessons(*spaces)
         self._n_refusals = 0
 
-    def run(self) -> None:
-        """Spends the budget. Raises ProtocolError when the gateway stays unreachable or keeps refusing."""
+    def run(self) -> bool:
+        """Spends the budget, and returns True. Raises ProtocolError when the gateway stays unreachable or keeps
+        refusing."""
         self._system.mkdir(exist_ok=True)
         stage_code(self._system)
-        plan = make_plan(max(self._budget, 1), *self._bounds)
+        plan = make_plan(max(self._budget, 1), self._least, self._most)
         print(f"{self._env}: {self._budget} episodes, {plan}", flush=True)
         if plan.opening:
             self._play_population("opening", self._search.opening(plan.opening))
@@ -59,17 +60,18 @@ class Agent:
             candidates = self._search.round(max(1, size // self._search.repeats))
             self._play_population(f"round {number}", candidates, n_episodes=size)
         self._play_finals(plan.finals, plan.episodes_per_final)
+        return True
 
     def _play_finals(self, n: int, n_episodes: int) -> None:
         """Submits single candidates on the same fresh cases, until no budget is left for a submit."""
         first_case = self._next_case
-        least = max(n_episodes, self._bounds[0])
-        number = 0
-        while self._budget >= self._bounds[0] and self._budget > 0:
-            number += 1
+        least = max(n_episodes, self._least)
+        for number in itertools.count(1):
+            if self._budget < max(self._least, 1):
+                return
             spend = min(least, self._budget)
             if number >= n or self._budget - spend < least:
-                spend = min(self._budget, self._bounds[1])
+                spend = min(self._budget, self._most)
             self._next_case = first_case
             self._play_population(f"final {number}", [self._search.finalist()], n_episodes=spend)
 
@@ -77,9 +79,8 @@ class Agent:
         self, title: str, candidates: list[Candidate], n_episodes: int | None = None
     ) -> None:
         """Submits the candidates in turns: all of them on one case, then all on the next."""
-        total = max(n_episodes or len(candidates), self._bounds[0])
-        total = min(total, self._bounds[1], self._budget)
-        if total < self._bounds[0] or not candidates:
+        total = min(max(n_episodes or len(candidates), self._least), self._most, self._budget)
+        if total < self._least or not candidates:
             return
         schedule = [i % len(candidates) for i in range(total)]
         turns = [i // len(candidates) for i in range(total)]
@@ -97,45 +98,36 @@ class Agent:
                 raise ProtocolError(f"refused {self._n_refusals} times, last: {verdict.message}")
             self._budget = int(self._client.info()["state"]["remaining_budget"])
             return
-        self._budget = int(verdict.summary["remaining_budget"])
-        self._learn(verdict, candidates, schedule, cases)
-        self._report(title, verdict, candidates)
+        summary = verdict.summary
+        self._budget = int(summary["remaining_budget"])
+        returns = summary.get("returns") if verdict.status == "ok" else None
+        result = f"{summary.get('n_episodes')} episodes charged for nothing"
+        if returns:
+            result = f"mean {np.mean(returns):.2f}, best {np.max(returns):.2f}"
+            self._learn(verdict, candidates, schedule, cases)
+        line = f"{verdict.name} {title}: {verdict.status}, {len(candidates)} candidates, {result}"
+        for leader in self._search.ranking()[:1]:
+            values = [episode.episode_return for episode in leader.episodes]
+            line += f"; leader {leader.family.name} {np.mean(values):.2f} over {len(values)}"
+        print(f"{line}; {self._budget} episodes left", flush=True)
 
     def _learn(
         self, verdict: Verdict, candidates: list[Candidate], schedule: list[int], cases: list[int]
     ) -> None:
-        returns = verdict.summary.get("returns")
-        if verdict.status != "ok" or not returns:
-            return
-        failed = set(verdict.summary.get("errors") or ()) | set(verdict.summary.get("timeouts") or ())
-        episodes = self._trajectories(verdict, len(schedule)) if len(candidates) > 1 else []
+        summary, returns = verdict.summary, verdict.summary["returns"]
+        failed = set(summary.get("errors") or ()) | set(summary.get("timeouts") or ())
+        # Trajectories of equal returns still tell how far each episode came.
+        taught = self._lessons.wanted or len(set(returns)) <= len(returns) // 2
+        episodes: list[list[Step]] = []
+        if taught and len(candidates) > 1:
+            first = int(summary["first_global_episode"])
+            episodes = read_episodes(self._feedback / verdict.name, range(first, first + len(schedule)))
         for index, (turn, case, value) in enumerate(zip(schedule, cases, returns, strict=True)):
             if index not in failed and value is not None and np.isfinite(value):
                 new = novelty(episodes[index]) if episodes else 0
                 candidates[turn].episodes.append(Episode(case=case, episode_return=float(value), novelty=new))
         for family in self._lessons.learn(episodes):
             self._search.add_family(family)
-
-    def _trajectories(self, verdict: Verdict, n_episodes: int) -> list[list[Step]]:
-        """Trajectories of a population's episodes, if they can teach anything; else none."""
-        returns = verdict.summary["returns"]
-        if len(set(returns)) > len(returns) // 2 and not self._lessons.wanted:
-            return []
-        first = int(verdict.summary["first_global_episode"])
-        return read_episodes(self._feedback / verdict.name, range(first, first + n_episodes))
-
-    def _report(self, title: str, verdict: Verdict, candidates: list[Candidate]) -> None:
-        """Prints one line: the submit, its result, the leader, the remaining budget."""
-        line = f"{verdict.name} {title}: {verdict.status}, {len(candidates)} candidates"
-        returns = verdict.summary.get("returns")
-        if verdict.status == "ok" and returns:
-            line += f", mean {np.mean(returns):.2f}, best {np.max(returns):.2f}"
-        else:
-            line += f", {verdict.summary.get('n_episodes')} episodes charged for nothing"
-        for leader in self._search.ranking()[:1]:
-            values = [episode.episode_return for episode in leader.episodes]
-            line += f"; leader {leader.family.name} {np.mean(values):.2f} over {len(values)}"
-        print(f"{line}; {self._budget} episodes left", flush=True)
 
 
 class Lessons:
@@ -168,10 +160,8 @@ def stage_code(system: Path) -> None:
     """Copies the policy's code into `system`, and replaces its `policy.py`."""
     target = system / PACKAGE
     target.mkdir(parents=True, exist_ok=True)
-    for item in (resources.files("evopolicy_gateway.agents.evolve") / PACKAGE).iterdir():
-        if item.name.endswith(".py"):
-            with resources.as_file(item) as path:
-                shutil.copyfile(path, target / item.name)
+    for path in (Path(__file__).parent / PACKAGE).glob("*.py"):
+        shutil.copyfile(path, target / path.name)
     does = f'"""Plays the candidates listed in `{CANDIDATES_FILE}`."""'
     _replace(system / "policy.py", f"{does}\n\nfrom {PACKAGE}.policy import Policy as Policy\n")
 
@@ -189,12 +179,6 @@ def _replace(path: Path, text: str) -> None:
     os.replace(temporary, path)
 
 
-def main() -> int:
-    """Runs the agent in the current folder. Returns 0 when the budget is spent, 1 when the gateway is unusable."""
-    try:
-        Agent(Client.from_environment(), Path.cwd()).run()
-    except (KeyError, ProtocolError) as error:
-        why = f"{error} is not set; it is started by a gateway" if isinstance(error, KeyError) else error
-        print(f"evolve: {why}", file=sys.stderr)
-        return 1
-    return 0
+def main() -> NoReturn:
+    """Runs the agent in the current folder."""
+    exit_after("evolve", lambda client: Agent(client, Path.cwd()).run())

@@ -128,7 +128,5 @@ def _bang_bang(obs_space: Schema, action_space: Schema, n_outputs: int, n_featur
             weights = np.zeros((n_outputs, n_features + 1))
             weights[:, feature] = sign * BANG_BANG_GAIN * ends
             first.append(weights.reshape(-1))
-    size = n_outputs * (n_features + 1)
-    scale = np.full(size, BANG_BANG_GAIN / 10)
-    spread = np.full(size, BANG_BANG_GAIN / 3)
+    spread, scale = (np.full(n_outputs * (n_features + 1), BANG_BANG_GAIN / part) for part in (3, 10))
     return _family("linear", spread, name="bang-bang", first=tuple(first), scale=scale, weight=1)

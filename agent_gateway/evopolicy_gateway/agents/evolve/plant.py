@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from evopolicy_gateway.agents.evolve.evolved.spaces import Schema, goal_keys
+from evopolicy_gateway.agents.evolve.evolved.spaces import GOALS, Schema, goal_keys
 from evopolicy_gateway.agents.evolve.feedback import Step
 
 N_AXES = 3
@@ -34,15 +34,22 @@ def find_plant(obs_space: Schema, action_space: Schema, episodes: list[list[Step
     if sum(map(len, long_enough)) < MIN_STEPS:
         return None
     observed, achieved, desired, displacement, actions = _stack(long_enough)
-    correlation = _correlations(displacement, actions)
-    axes = _match_axes(correlation, observed, achieved, desired)
+    centred = actions - actions.mean(axis=0)
+    shifts = displacement - displacement.mean(axis=0)
+    scale = np.outer(np.linalg.norm(shifts, axis=0), np.linalg.norm(centred, axis=0))
+    axes = _match_axes(np.abs(shifts.T @ centred) / np.maximum(scale, 1e-12), observed, achieved, desired)
     if axes is None:
         return None
-    effector = [component for component, _ in axes]
-    outputs = [output for _, output in axes]
     slopes = [_slope(displacement[:, c], actions[:, o]) / REACTION_STEPS for c, o in axes]
-    lift_axis = _lift_axis(achieved, float(np.abs(slopes).mean()))
-    return {"effector": effector, "outputs": outputs, "slopes": slopes, "lift_axis": lift_axis}
+    moved = np.ptp(achieved, axis=0)
+    # The disturbed thing moved least along the lift axis, as it rests on something.
+    disturbed = moved.max() > max(float(np.abs(slopes).mean()) / 2, 3 * moved.min())
+    return {
+        "effector": [component for component, _ in axes],
+        "outputs": [output for _, output in axes],
+        "slopes": slopes,
+        "lift_axis": int(np.argmin(moved)) if disturbed else N_AXES - 1,
+    }
 
 
 Rows = NDArray[np.float64]
@@ -50,43 +57,23 @@ Rows = NDArray[np.float64]
 
 def _stack(episodes: list[list[Step]]) -> tuple[Rows, Rows, Rows, Rows, Rows]:
     """Rows of observation, achieved and desired goal, displacement and mean action over the reaction time."""
-    parts: list[list[Rows]] = [[], [], [], [], []]
+    parts: list[tuple[Rows, ...]] = []
     k = REACTION_STEPS
     for steps in episodes:
-        seen = [np.array([np.ravel(s.obs[key]) for s in steps], dtype=float) for key in _KEYS]
+        seen = [np.array([np.ravel(s.obs[key]) for s in steps], float) for key in ("observation", *GOALS)]
         acted = np.array([np.ravel(s.action) for s in steps], dtype=float)
-        for part, rows in zip(
-            parts, [*(rows[:-k] for rows in seen), seen[0][k:] - seen[0][:-k]], strict=False
-        ):
-            part.append(rows)
-        parts[4].append(np.mean([acted[i : len(acted) - k + i] for i in range(k)], axis=0))
-    observed, achieved, desired, displacement, actions = (np.concatenate(part) for part in parts)
+        mean_action = np.mean([acted[i : len(acted) - k + i] for i in range(k)], axis=0)
+        parts.append((*(rows[:-k] for rows in seen), seen[0][k:] - seen[0][:-k], mean_action))
+    observed, achieved, desired, displacement, actions = map(np.concatenate, zip(*parts, strict=True))
     return observed, achieved, desired, displacement, actions
-
-
-_KEYS = ("observation", "achieved_goal", "desired_goal")
-
-
-def _correlations(displacement: Rows, actions: Rows) -> Rows:
-    """Absolute correlation of every component's displacement with every output, shape (components, outputs)."""
-    d = displacement - displacement.mean(axis=0)
-    a = actions - actions.mean(axis=0)
-    scale = np.outer(np.linalg.norm(d, axis=0), np.linalg.norm(a, axis=0))
-    correlation: Rows = np.abs(d.T @ a) / np.maximum(scale, 1e-12)
-    return correlation
-
-
-def _lift_axis(achieved: Rows, step: float) -> int:
-    """The axis along which the disturbed thing moved least, as it rests on something. If it did not move, the last
-    axis."""
-    moved = np.ptp(achieved, axis=0)
-    return int(np.argmin(moved)) if moved.max() > max(step / 2, 3 * moved.min()) else N_AXES - 1
 
 
 def _match_axes(
     correlation: Rows, observed: Rows, achieved: Rows, desired: Rows
 ) -> list[tuple[int, int]] | None:
-    """Per goal axis, the observation component and the output that moves along it; None when an axis has none."""
+    """Per goal axis, the observation component and the output that moves along it; None when an axis has none.
+
+    `correlation`: absolute, of every component's displacement with every output, shape (components, outputs)."""
     reach = np.maximum(np.ptp(observed, axis=0), np.abs(desired - achieved).max())
     axes: list[tuple[int, int]] = []
     for axis in range(achieved.shape[1]):

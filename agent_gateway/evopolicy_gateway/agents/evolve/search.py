@@ -61,11 +61,8 @@ class Candidate:
 
     def as_json(self) -> dict[str, Any]:
         """Its entry in `candidates.json`."""
-        return {
-            "kind": self.family.kind,
-            "vector": [float(f"{value:.7g}") for value in self.vector],
-            "settings": self.family.settings,
-        }
+        vector = [float(f"{value:.7g}") for value in self.vector]
+        return {"kind": self.family.kind, "vector": vector, "settings": self.family.settings}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -98,12 +95,8 @@ def make_plan(budget: int, min_per_submit: int, max_per_submit: int) -> Plan:
     least = max(4, min_per_submit)
     n_rounds = min(-(-fresh // max(most, least)), fresh // least)
     rounds = tuple(min(fresh // n_rounds + (i < fresh % n_rounds), max_per_submit) for i in range(n_rounds))
-    return Plan(
-        opening=opening,
-        rounds=tuple(size for size in rounds if size >= min_per_submit),
-        finals=n_finals,
-        episodes_per_final=per_final,
-    )
+    rounds = tuple(size for size in rounds if size >= min_per_submit)
+    return Plan(opening=opening, rounds=rounds, finals=n_finals, episodes_per_final=per_final)
 
 
 class Search:
@@ -143,7 +136,8 @@ class Search:
                 drawn += batch
                 if len(batch) < share:
                     sources.remove(family)
-        return self._joined(drawn[:n])
+        self.candidates += drawn[:n]
+        return drawn[:n]
 
     def round(self, n: int) -> list[Candidate]:
         """Survivors and their mutants, `n` together."""
@@ -155,13 +149,14 @@ class Search:
         survivors = self._survivors(max(1, round((n - len(fresh)) * SURVIVING_SHARE)))
         n_mutants = n - len(fresh) - len(survivors)
         fresh += [self._mutant(survivors, strength) for _ in range(n_mutants)]
-        return survivors + self._joined(fresh)
+        self.candidates += fresh
+        return survivors + fresh
 
     def finalist(self) -> Candidate:
         """The next candidate for a checkpoint of its own.
 
-        Alternates between the best one left and the best of a family seldom chosen so far: the hidden validation plays
-        more cases than the search did, so a hedge against a lucky leader costs little.
+        Alternates between the best one without a checkpoint and the best of a family seldom chosen so far: the hidden
+        validation plays more cases than the search did, so a hedge against a lucky leader costs little.
         """
         taken = [c for c in self.candidates if c.is_final]
         candidates = [c for c in _distinct(taken, self.ranking()) if not c.is_final]
@@ -204,13 +199,12 @@ class Search:
         tried = self._tried
         if not tried or np.ptp(self._returns) < 1e-9:
             return 1
-        if self.is_sparse:
+        if (
+            self.is_sparse or max(len(c.episodes) for c in tried) < 2
+        ):  # else nothing is known of the noise yet
             return 2
-        if max(len(c.episodes) for c in tried) < 2:
-            return 2  # nothing is known of the noise yet
-        last = [
-            c.episodes[-1].episode_return for c in tried if c.episodes[-1].case == tried[-1].episodes[-1].case
-        ]
+        latest = [c.episodes[-1] for c in tried]
+        last = [e.episode_return for e in latest if e.case == latest[-1].case]
         tied = last.count(max(last)) > len(last) * TIED_SHARE
         ratio = self._effects(tried)[1]
         return 4 if ratio > VERY_NOISY_RATIO else 2 if tied or ratio > NOISY_RATIO else 1
@@ -280,10 +274,9 @@ class Search:
 
     def _draw(self, parents: list[Candidate]) -> Candidate:
         """A new candidate of any family that has candidates left; else the best parent again."""
-        for index in self._rng.permutation(len(self._families)):
-            for one in self._drawn(self._families[int(index)], 1):
-                return one
-        return Candidate(family=parents[0].family, vector=parents[0].vector)
+        order = self._rng.permutation(len(self._families))
+        drawn = (one for index in order for one in self._drawn(self._families[int(index)], 1))
+        return next(drawn, None) or Candidate(family=parents[0].family, vector=parents[0].vector)
 
     def _mean_of_best(self) -> Candidate | None:
         """The mean of the leading family's best candidates, as in the cross-entropy method."""
@@ -291,26 +284,20 @@ class Search:
         elite = [c for c in ranked if c.family is ranked[0].family and len(c.episodes) > 1][:3]
         if len(elite) < 2 or not elite[0].family.scale.any():
             return None
-        vector = np.mean([c.vector for c in elite], axis=0)
-        return self._joined([Candidate(family=elite[0].family, vector=vector)])[0]
+        mean = Candidate(family=elite[0].family, vector=np.mean([c.vector for c in elite], axis=0))
+        self.candidates.append(mean)
+        return mean
 
     def _drawn(self, family: Family, n: int) -> list[Candidate]:
-        """The next `n` candidates of a family, or as many as there are."""
         return [Candidate(family=family, vector=v) for v in islice(self._sources[family.name], n)]
-
-    def _joined(self, candidates: list[Candidate]) -> list[Candidate]:
-        self.candidates += candidates
-        return candidates
 
 
 def _distinct(kept: list[Candidate], ranked: list[Candidate]) -> list[Candidate]:
     """`ranked` without candidates whose returns equal those of a kept or better one on all shared cases."""
-    seen = list(kept)
     distinct: list[Candidate] = []
     for candidate in ranked:
-        if not any(_same_behaviour(candidate, other) for other in seen):
+        if not any(_same_behaviour(candidate, other) for other in (*kept, *distinct)):
             distinct.append(candidate)
-            seen.append(candidate)
     return distinct
 
 

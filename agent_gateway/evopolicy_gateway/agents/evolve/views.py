@@ -25,6 +25,7 @@ MIN_MOVES = 25
 MAX_MOVES = 1500
 MIN_AGREEMENT = 0.7
 MIN_MAPPED_SHARE = 0.3
+MAX_STILL_SHARE = 0.7
 MIN_SEEN = 8
 """How often a symbol must have been met at the touched cell before it can count as blocking."""
 RARE_FRAMES = 0.3
@@ -74,36 +75,43 @@ def find_views(obs_space: Schema, action_space: Schema, runs: list[ViewLog]) -> 
     for action in range(action_space["n"]):
         moved = np.flatnonzero((actions == action) & (changed_cells > 1))[:MAX_MOVES]
         if len(moved) >= MIN_MOVES and len(moved) > 0.1 * np.count_nonzero(actions == action):
-            cells = _source_cells(before[moved], after[moved], _rarity(frames))
-            if np.mean(cells >= 0) > MIN_MAPPED_SHARE and not _is_still(cells):
+            cells = _source_cells(before[moved], after[moved], frames)
+            mapped = np.flatnonzero(cells >= 0)
+            stays = int(np.count_nonzero(cells[mapped] == mapped))
+            if len(mapped) > MIN_MAPPED_SHARE * len(cells) and stays <= MAX_STILL_SHARE * len(mapped):
                 maps[action] = cells
     outputs = _advance_and_touch(before, actions, changed_cells > 1, maps)
     if outputs is None:
         return None
     advance, touch = outputs
-    blocked, passed = _barriers(before[:, touch], actions == advance, changed_cells > 1)
+    # Symbols that stopped the advance more often than not, those that let it pass, and those in few frames.
+    advanced = actions == advance
+    passing = {
+        int(symbol): (changed_cells > 1)[advanced & (before[:, touch] == symbol)]
+        for symbol in np.unique(before[advanced, touch])
+    }
+    blocked = {one for one, went in passing.items() if len(went) >= MIN_SEEN and went.mean() < 0.5}
+    passed = {one for one, went in passing.items() if went.mean() >= 0.5}
+    shown = Counter(symbol for frame in frames for symbol in set(frame.tolist()))
+    rare = {symbol for symbol, count in shown.items() if count < RARE_FRAMES * len(frames)}
     return {
         "key": find_grid(obs_space)[1],
         "maps": {str(action): cells.tolist() for action, cells in maps.items()},
         "advance": advance,
         "touch": touch,
         "blocked": sorted(blocked),
-        "rare": sorted(_rare(frames) - passed),
+        "rare": sorted(rare - passed),
         "prizes": _prizes(runs, touch),
     }
 
 
-def _rarity(frames: Symbols) -> dict[int, float]:
-    """-log of each symbol's share of all cells."""
-    symbols, counts = np.unique(frames, return_counts=True)
-    return {int(s): float(-np.log(c / frames.size)) for s, c in zip(symbols, counts, strict=True)}
-
-
-def _source_cells(before: Symbols, after: Symbols, rarity: dict[int, float]) -> Symbols:
-    """For each cell, the cell from which its symbol comes; -1 if none agrees well enough."""
+def _source_cells(before: Symbols, after: Symbols, frames: Symbols) -> Symbols:
+    """For each cell, the cell from which its symbol comes; -1 if none agrees well enough. Symbols weigh -log of their
+    share of all cells in `frames`."""
     n_cells = before.shape[1]
-    weigh = np.vectorize(lambda symbol: rarity[int(symbol)], otypes=[float])
-    weight_before, weight_after = weigh(before), weigh(after)
+    symbols, counts = np.unique(frames, return_counts=True)
+    rarity = -np.log(counts / frames.size)
+    weight_before, weight_after = (rarity[np.searchsorted(symbols, view)] for view in (before, after))
     agreement = np.empty((n_cells, n_cells))
     for cell in range(n_cells):
         same = before == after[:, cell : cell + 1]
@@ -112,11 +120,6 @@ def _source_cells(before: Symbols, after: Symbols, rarity: dict[int, float]) -> 
         agreement[cell] = shared / np.maximum(whole, 1e-9)
     best = agreement.argmax(axis=1)
     return np.where(agreement.max(axis=1) >= MIN_AGREEMENT, best, -1).astype(np.int32)
-
-
-def _is_still(cells: Symbols) -> bool:
-    mapped = cells >= 0
-    return bool(np.mean(cells[mapped] == np.flatnonzero(mapped)) > 0.7)
 
 
 def _advance_and_touch(
@@ -150,34 +153,13 @@ def _information(symbols: Symbols, outcome: NDArray[np.bool_]) -> float:
     kinds = np.unique(symbols, return_inverse=True)[1]
     n = np.bincount(kinds)
     yes = np.bincount(kinds, outcome)
-    within = float((n / n.sum() * _entropy(yes / n)).sum())
-    return float(_entropy(np.array([outcome.mean()]))[0]) - within
+    return float(_entropy(outcome.mean()) - (n / n.sum() * _entropy(yes / n)).sum())
 
 
-def _entropy(p: NDArray[np.float64]) -> NDArray[np.float64]:
+def _entropy(p: Any) -> Any:
+    """Of binary outcomes with chances `p`, bits."""
     q = np.clip(p, 1e-12, 1 - 1e-12)
-    entropy: NDArray[np.float64] = -(q * np.log2(q) + (1 - q) * np.log2(1 - q))
-    return entropy
-
-
-def _barriers(
-    touched: Symbols, advancing: NDArray[np.bool_], moved: NDArray[np.bool_]
-) -> tuple[set[int], set[int]]:
-    """Symbols that stopped the advance more often than not, and those that let it pass."""
-    blocked, passed = set(), set()
-    for symbol in np.unique(touched[advancing]):
-        outcome = moved[advancing & (touched == symbol)]
-        if len(outcome) >= MIN_SEEN and outcome.mean() < 0.5:
-            blocked.add(int(symbol))
-        elif outcome.mean() >= 0.5:
-            passed.add(int(symbol))
-    return blocked, passed
-
-
-def _rare(frames: Symbols) -> set[int]:
-    """Symbols that few frames contain."""
-    shown = Counter(symbol for frame in frames for symbol in set(frame.tolist()))
-    return {symbol for symbol, count in shown.items() if count < RARE_FRAMES * len(frames)}
+    return -(q * np.log2(q) + (1 - q) * np.log2(1 - q))
 
 
 def _prizes(runs: list[ViewLog], touch: int) -> list[list[int]]:
@@ -190,5 +172,5 @@ def _prizes(runs: list[ViewLog], touch: int) -> list[list[int]]:
         for run in runs
         for t in np.flatnonzero(run.rewards > 0)
     )
-    usual = dict(pair for _, pair in sorted((count, pair) for pair, count in pairs.items()))
+    usual = dict(sorted(pairs, key=lambda pair: (pairs[pair], pair)))
     return [list(pair) for pair in sorted(usual.items())]

@@ -20,11 +20,7 @@ class Session:
 
     def load(self) -> list[Message]:
         """The messages; none when the first turn failed before anything was saved."""
-        try:
-            messages = json.loads(self._path.read_text())
-        except FileNotFoundError:
-            return []
-        return list(messages)
+        return list(json.loads(self._path.read_text())) if self._path.exists() else []
 
     def save(self, messages: Sequence[Message]) -> None:
         """Saves them; a program that is killed meanwhile leaves the earlier ones."""
@@ -51,8 +47,9 @@ class Events:
     def reply(self, reply: Reply) -> None:
         """The model's text and tool calls, and the tokens that they took."""
         blocks: list[dict[str, Any]] = [{"type": "text", "text": reply.text}] if reply.text else []
-        for call in reply.calls:
-            blocks.append({"type": "tool_use", "id": call.id, "name": call.name, "input": call.given})
+        blocks += [
+            {"type": "tool_use", "id": one.id, "name": one.name, "input": one.given} for one in reply.calls
+        ]
         self._n += 1
         message = {"id": f"m{self._n}", "role": "assistant", "content": blocks, "usage": reply.usage}
         self._emit({"type": "assistant", "message": message})

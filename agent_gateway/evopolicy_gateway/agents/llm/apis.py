@@ -6,11 +6,12 @@ are streamed, so that a long one meets no timeout on the way.
 
 from __future__ import annotations
 
+import importlib
 import json
 import re
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,8 @@ SYSTEM = (
 )
 _SKILLS = "\n\nThese files describe skills. Read one with the shell when its description fits what you do:"
 _MAX_HEADER = 2000
+_TOOL = {"name": shell.NAME, "description": shell.DESCRIPTION}
+_COUNTS = ("input_tokens", "cache_read_input_tokens", "cache_creation_input_tokens", "output_tokens")
 _LEFT_OUT = "[left out, as the conversation became too long]"
 _KEPT_OUTPUTS = (8, 2)
 """Outputs of the last commands that shortening keeps; fewer where the earlier ones are left out already."""
@@ -53,8 +56,7 @@ class Reply:
     text: str
     calls: tuple[Call, ...]
     usage: dict[str, int]
-    """Tokens: `input_tokens` without cached ones, `cache_read_input_tokens`, `cache_creation_input_tokens`,
-    `output_tokens`."""
+    """Tokens by `_COUNTS`; `input_tokens` without cached ones."""
 
     @property
     def context(self) -> int:
@@ -79,21 +81,23 @@ class ApiError(Exception):
 class Api(ABC):
     """One conversation. `messages` have the form of the protocol, without the system prompt."""
 
-    _error: type[Exception]
-    """The base of the vendor's own errors."""
+    client: str
+    """Name of the client's class in the vendor's library, whose own errors are named after it."""
 
     def __init__(self, settings: dict[str, Any], key: str, messages: list[Message]) -> None:
         self.messages = messages
         self.context_tokens = int(settings["context_tokens"])
-        self._model = str(settings["model"])
         self._max_output_tokens = int(settings["max_output_tokens"])
-        self._parameters: dict[str, Any] = settings["parameters"]
+        self._known = {"model": str(settings["model"]), "extra_body": settings["parameters"]}
         self._system = (settings["system"] or SYSTEM) + _skills(settings.get("skills", ()))
-        self._connection: dict[str, Any] = {
-            "api_key": key or "none",
-            "max_retries": int(settings["retries"]),
-            "timeout": float(settings["timeout_s"]),
-        } | ({"base_url": settings["base_url"]} if settings["base_url"] else {})
+        library: Any = importlib.import_module(self.client.lower())
+        self._error: type[Exception] = getattr(library, f"{self.client}Error")
+        self._client = getattr(library, self.client)(
+            api_key=key or "none",
+            max_retries=int(settings["retries"]),
+            timeout=float(settings["timeout_s"]),
+            base_url=settings["base_url"] or None,
+        )
 
     def say(self, text: str) -> None:
         """Adds a prompt."""
@@ -138,28 +142,17 @@ class Api(ABC):
 class OpenAi(Api):
     """Chat Completions."""
 
-    def __init__(self, settings: dict[str, Any], key: str, messages: list[Message]) -> None:
-        super().__init__(settings, key, messages)
-        import openai
-
-        self._client = openai.OpenAI(**self._connection)
-        self._error = openai.OpenAIError
+    client = "OpenAI"
 
     def _ask(self) -> Reply:
-        function = {
-            "name": shell.NAME,
-            "description": shell.DESCRIPTION,
-            "parameters": shell.PARAMETERS,
-        }
         text, usage, answered = "", None, False
         calls: dict[int, dict[str, str]] = {}
         stream = self._client.chat.completions.create(
-            model=self._model,
             messages=[{"role": "system", "content": self._system}, *self.messages],
-            tools=[{"type": "function", "function": function}],
+            tools=[{"type": "function", "function": _TOOL | {"parameters": shell.PARAMETERS}}],
             stream=True,
             stream_options={"include_usage": True},
-            extra_body=self._parameters,
+            **self._known,
         )
         for chunk in stream:
             usage = chunk.usage or usage
@@ -174,30 +167,21 @@ class OpenAi(Api):
                         call["arguments"] += part.function.arguments or ""
         if not answered:
             raise ValueError("it has no choice")
-        message: Message = {"role": "assistant", "content": text or None}
-        if calls:
-            message["tool_calls"] = [
-                {
-                    "id": call["id"],
-                    "type": "function",
-                    "function": {"name": call["name"], "arguments": _sent_back(call["arguments"])},
-                }
-                for call in calls.values()
-            ]
-        elif not text:
-            message["content"] = ""
-        self.messages.append(message)
-        details = getattr(usage, "prompt_tokens_details", None)
-        cached = getattr(details, "cached_tokens", None) or 0
+        sent_back = [
+            {
+                "id": call["id"],
+                "type": "function",
+                "function": {"name": call["name"], "arguments": _sent_back(call["arguments"])},
+            }
+            for call in calls.values()
+        ]
+        message: Message = {"role": "assistant", "content": text or (None if calls else "")}
+        self.messages.append(message | ({"tool_calls": sent_back} if calls else {}))
+        cached = _count(getattr(usage, "prompt_tokens_details", None), "cached_tokens")
+        fresh = max(0, _count(usage, "prompt_tokens") - cached)
+        made = tuple(_call(call["id"], call["name"], call["arguments"]) for call in calls.values())
         return Reply(
-            text=text,
-            calls=tuple(_call(call["id"], call["name"], call["arguments"]) for call in calls.values()),
-            usage={
-                "input_tokens": max(0, (getattr(usage, "prompt_tokens", 0) or 0) - cached),
-                "cache_read_input_tokens": cached,
-                "cache_creation_input_tokens": 0,
-                "output_tokens": getattr(usage, "completion_tokens", 0) or 0,
-            },
+            text=text, calls=made, usage=_usage(fresh, cached, 0, _count(usage, "completion_tokens"))
         )
 
     def answer(self, calls: Sequence[Call], outputs: Sequence[str]) -> None:
@@ -211,45 +195,25 @@ class OpenAi(Api):
 class Anthropic(Api):
     """Messages. The conversation so far is marked for the provider's cache."""
 
-    def __init__(self, settings: dict[str, Any], key: str, messages: list[Message]) -> None:
-        super().__init__(settings, key, messages)
-        import anthropic
-
-        self._client = anthropic.Anthropic(**self._connection)
-        self._error = anthropic.AnthropicError
+    client = "Anthropic"
 
     def _ask(self) -> Reply:
-        tool = {
-            "name": shell.NAME,
-            "description": shell.DESCRIPTION,
-            "input_schema": shell.PARAMETERS,
-        }
         with self._client.messages.stream(
-            model=self._model,
             max_tokens=self._max_output_tokens,
             system=self._system,
             messages=self._marked(),
-            tools=[tool],
-            extra_body=self._parameters,
+            tools=[_TOOL | {"input_schema": shell.PARAMETERS}],
+            **self._known,
         ) as stream:
             message = stream.get_final_message()
         # With its thinking, whose signature the API checks when it comes back.
         content = [block.model_dump(mode="json", exclude_none=True) for block in message.content]
         self.messages.append({"role": "assistant", "content": content or [{"type": "text", "text": "…"}]})
-        usage = message.usage
+        calls = [block for block in content if block["type"] == "tool_use"]
         return Reply(
             text="\n".join(block["text"] for block in content if block["type"] == "text"),
-            calls=tuple(
-                _call(block["id"], block["name"], block["input"])
-                for block in content
-                if block["type"] == "tool_use"
-            ),
-            usage={
-                "input_tokens": usage.input_tokens,
-                "cache_read_input_tokens": usage.cache_read_input_tokens or 0,
-                "cache_creation_input_tokens": usage.cache_creation_input_tokens or 0,
-                "output_tokens": usage.output_tokens,
-            },
+            calls=tuple(_call(block["id"], block["name"], block["input"]) for block in calls),
+            usage=_usage(*(_count(message.usage, name) for name in _COUNTS)),
         )
 
     def answer(self, calls: Sequence[Call], outputs: Sequence[str]) -> None:
@@ -260,13 +224,8 @@ class Anthropic(Api):
         self.messages.append({"role": "user", "content": blocks})
 
     def _outputs(self) -> list[Message]:
-        parts = [
-            block
-            for message in self.messages
-            if message["role"] == "user" and isinstance(message["content"], list)
-            for block in message["content"]
-        ]
-        return [part for part in parts if part["type"] == "tool_result"]
+        lists = [message["content"] for message in self.messages if isinstance(message["content"], list)]
+        return [block for blocks in lists for block in blocks if block["type"] == "tool_result"]
 
     def _marked(self) -> list[Message]:
         *earlier, last = self.messages
@@ -276,10 +235,7 @@ class Anthropic(Api):
         return [*earlier, last | {"content": blocks}]
 
 
-APIS: dict[str, Callable[[dict[str, Any], str, list[Message]], Api]] = {
-    "openai": OpenAi,
-    "anthropic": Anthropic,
-}
+APIS: dict[str, type[Api]] = {"openai": OpenAi, "anthropic": Anthropic}
 """By the name of the protocol, which is also that of the library."""
 
 
@@ -293,48 +249,49 @@ def _skills(paths: Sequence[str]) -> str:
     listed = []
     for path in paths:
         text = Path(path).expanduser().read_text(errors="replace")
-        header = (
-            text.removeprefix("---\n").partition("\n---")[0]
-            if text.startswith("---\n")
-            else text.partition("\n")[0]
-        )
+        headed = text.startswith("---\n")
+        header = text.removeprefix("---\n").partition("\n---" if headed else "\n")[0]
         listed.append(f"\n\n{path}\n{header.strip()[:_MAX_HEADER]}")
     return _SKILLS + "".join(listed) if listed else ""
 
 
 def _call(identity: str, name: str, arguments: Any) -> Call:
     """A call as the model wrote it, which may be anything."""
-    try:
-        said = json.loads(arguments) if isinstance(arguments, str) else arguments
-    except (ValueError, RecursionError):
-        said = arguments
+    said = _decoded(arguments)
     given = said if isinstance(said, dict) else {"text": str(said)}
-    return replace(_checked(identity, name, said), name=name, given=given)
-
-
-def _checked(identity: str, name: str, given: Any) -> Call:
+    known: dict[str, Any] = {"id": identity, "name": name, "given": given}
     if name != shell.NAME:
-        return Call(id=identity, fault=f"there is no tool {name!r}; the only one is {shell.NAME}")
-    if not isinstance(given, dict):
-        return Call(id=identity, fault="the arguments are not a JSON object; give one with `command`")
+        return Call(**known, fault=f"there is no tool {name!r}; the only one is {shell.NAME}")
+    if said is not given:
+        return Call(**known, fault="the arguments are not a JSON object; give one with `command`")
     try:
         command, timeout_s = given["command"], float(given.get("timeout_s") or shell.USUAL_S)
     except (ValueError, TypeError, KeyError) as error:
-        return Call(
-            id=identity, fault=f"the arguments cannot be read ({error!r}); give a JSON object with `command`"
-        )
+        why = f"the arguments cannot be read ({error!r}); give a JSON object with `command`"
+        return Call(**known, fault=why)
     if not isinstance(command, str) or not 0.0 < timeout_s < float("inf"):
-        return Call(id=identity, fault="`command` must be a text, and `timeout_s` a number above zero")
-    return Call(id=identity, command=command, timeout_s=min(timeout_s, shell.MOST_S))
+        return Call(**known, fault="`command` must be a text, and `timeout_s` a number above zero")
+    return Call(**known, command=command, timeout_s=min(timeout_s, shell.MOST_S))
+
+
+def _decoded(arguments: Any) -> Any:
+    try:
+        return json.loads(arguments) if isinstance(arguments, str) else arguments
+    except (ValueError, RecursionError):
+        return arguments
 
 
 def _sent_back(arguments: str) -> str:
-    """A call's arguments for the requests to come, which some endpoints refuse for good when these are no JSON
-    object."""
-    try:
-        return arguments if isinstance(json.loads(arguments), dict) else "{}"
-    except (ValueError, RecursionError):
-        return "{}"
+    """A call's arguments for later requests, which some endpoints refuse for good when they are no JSON object."""
+    return arguments if isinstance(_decoded(arguments), dict) else "{}"
+
+
+def _count(usage: Any, name: str) -> int:
+    return getattr(usage, name, None) or 0
+
+
+def _usage(*counts: int) -> dict[str, int]:
+    return dict(zip(_COUNTS, counts, strict=True))
 
 
 def _failure(error: Exception) -> ApiError:

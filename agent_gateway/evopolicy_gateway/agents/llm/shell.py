@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import signal
 import subprocess
@@ -48,14 +49,10 @@ def run(command: str, timeout_s: float) -> tuple[str, bool]:
             code = process.wait(timeout_s)
             how = f"exit status {code}" if code >= 0 else f"ended by signal {-code}"
         except subprocess.TimeoutExpired:
-            code, how = (
-                -1,
-                f"ended after {timeout_s:g} s; give a larger timeout_s to commands that take longer",
-            )
-        try:
+            code = -1
+            how = f"ended after {timeout_s:g} s; give a larger timeout_s to commands that take longer"
+        with contextlib.suppress(ProcessLookupError):
             os.killpg(process.pid, signal.SIGKILL)
-        except ProcessLookupError:
-            pass
         process.wait()
         return f"[{how}]\n{_shown(output)}", code == 0
 

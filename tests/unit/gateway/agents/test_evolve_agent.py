@@ -126,7 +126,8 @@ def test_missing_urls_are_reported_and_exit_with_one(
 ) -> None:
     for name in ("INFO", "TASK", "SUBMIT"):
         monkeypatch.delenv(f"EVOPOLICYGYM_{name}_URL", raising=False)
-    assert evolve.main() == 1
+    with pytest.raises(SystemExit, match="1"):
+        evolve.main()
     assert "EVOPOLICYGYM_INFO_URL" in capsys.readouterr().err
 
 

@@ -1,4 +1,4 @@
-"""What an agent makes of a gateway's answers: verdicts, refusals, and none at all."""
+"""The client of agents reads a gateway's answers: verdicts, refusals, and none at all."""
 
 from __future__ import annotations
 

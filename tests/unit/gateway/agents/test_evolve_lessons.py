@@ -1,4 +1,4 @@
-"""What trajectories teach: how a view of a world of rooms moves, and which action moves which part of a plant."""
+"""Lessons of trajectories: how a view of a world of rooms moves, and which action moves which part of a plant."""
 
 from __future__ import annotations
 
@@ -102,12 +102,12 @@ def random_play() -> list[list[Step]]:
 
 @pytest.fixture(scope="module")
 def settings(random_play: list[list[Step]]) -> dict[str, Any]:
-    found = find_views(OBS_SPACE, ACTION_SPACE, view_logs(OBS_SPACE, ACTION_SPACE, random_play))
-    assert found is not None
-    return found
+    views = find_views(OBS_SPACE, ACTION_SPACE, view_logs(OBS_SPACE, ACTION_SPACE, random_play))
+    assert views is not None
+    return views
 
 
-def test_moving_actions_and_the_cell_that_advancing_enters_are_found(
+def test_moving_actions_and_the_cell_that_advancing_enters_are_identified(
     settings: dict[str, Any],
 ) -> None:
     assert settings["advance"] == ADVANCE
@@ -123,7 +123,7 @@ def test_advancing_takes_every_symbol_from_the_row_above(settings: dict[str, Any
     assert (cells[1:] == above)[known].mean() > 0.9
 
 
-def test_what_stops_the_advance_is_told_from_what_does_not(settings: dict[str, Any]) -> None:
+def test_symbols_that_stop_the_advance_are_told_from_others(settings: dict[str, Any]) -> None:
     assert WALL in settings["blocked"]
     assert FLOOR not in settings["blocked"]
     assert DOOR in settings["rare"]
@@ -145,9 +145,9 @@ def test_seeker_reaches_the_goal_far_more_often_than_random_play(
 def test_a_symbol_that_paid_becomes_a_prize_with_the_action_that_paid() -> None:
     episodes = at_random(40, 400)
     assert any(steps[-1].reward for steps in episodes)
-    found = find_views(OBS_SPACE, ACTION_SPACE, view_logs(OBS_SPACE, ACTION_SPACE, episodes))
-    assert found is not None
-    assert found["prizes"] == [[GOAL, ADVANCE]]
+    views = find_views(OBS_SPACE, ACTION_SPACE, view_logs(OBS_SPACE, ACTION_SPACE, episodes))
+    assert views is not None
+    assert views["prizes"] == [[GOAL, ADVANCE]]
 
 
 def test_lessons_offer_the_seeker_once_the_view_is_understood(random_play: list[list[Step]]) -> None:
@@ -215,7 +215,7 @@ def episodes(*, moved: bool = True, n_steps: int = 40) -> list[list[Step]]:
 
 
 @pytest.mark.parametrize("moved", [True, False])
-def test_effector_and_the_outputs_that_move_it_are_found(moved: bool) -> None:
+def test_effector_and_the_outputs_that_move_it_are_identified(moved: bool) -> None:
     plant = find_plant(goal_space(3), box(4), episodes(moved=moved))
     assert plant is not None
     assert (plant["effector"], plant["outputs"], plant["lift_axis"]) == (HAND, DRIVERS, 2)

@@ -107,16 +107,16 @@ class Saliency:
 
 def fingerprint(obs: Any) -> bytes:
     """Bytes that are equal for equal observations; numbers are rounded to two decimals."""
-    if isinstance(obs, dict):
-        return b"".join(fingerprint(obs[key]) for key in sorted(obs))
-    if isinstance(obs, tuple):
-        return b"".join(fingerprint(part) for part in obs)
     if isinstance(obs, str):
         return obs.encode()
+    if isinstance(obs, dict):
+        obs = tuple(obs[key] for key in sorted(obs))
     try:
-        values = np.asarray(obs)
+        values = None if isinstance(obs, tuple) else np.asarray(obs)
     except ValueError:  # lists of different lengths: a tuple, as JSON has it
-        return b"".join(fingerprint(part) for part in obs)
+        values = None
+    if values is None:
+        return b"".join(map(fingerprint, obs))
     return np.round(values, 2).tobytes() if values.dtype.kind == "f" else values.tobytes()
 
 

@@ -29,13 +29,9 @@ Symbols = NDArray[np.int32]
 
 def find_grid(schema: Schema) -> tuple[bool, str | None]:
     """Whether the space contains a grid of symbols, and its key in a Dict (None at the top level)."""
-    if _is_grid(schema):
-        return True, None
-    if schema["type"] == "Dict":
-        for key, part in schema["spaces"].items():
-            if _is_grid(part):
-                return True, key
-    return False, None
+    parts = {None: schema} | (schema["spaces"] if schema["type"] == "Dict" else {})
+    keys = [key for key, part in parts.items() if _is_grid(part)]
+    return bool(keys), keys[0] if keys else None
 
 
 def _is_grid(schema: Schema) -> bool:
@@ -111,8 +107,7 @@ class GridSeeker:
         if prizes:
             cell = min(prizes, key=lambda c: len(ways[c]))
             return [*ways[cell], self._prizes[int(seen[cell])]]
-        rare = [cell for cell in ways if int(seen[cell]) in self._rare]
-        for cell in rare:
+        for cell in (cell for cell in ways if int(seen[cell]) in self._rare):
             symbol = int(seen[cell])
             visits = self._visits.get(symbol, 0)
             if self._rng.random() < self._rare_appeal / (self._rare_appeal + visits**2):

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from .spaces import Given, Vector
+from .spaces import GOALS, Given, Vector
 
 FACTOR_RANGE = 3.0
 """Factors lie between 2 to minus this and 2 to this."""
@@ -43,10 +43,8 @@ class Mover:
 
     def _positions(self, obs: Any) -> tuple[Vector, Vector, Vector]:
         """Positions of the thing, its goal, and the effector; each a new float64 vector with one element per axis."""
-        thing = np.array(obs["achieved_goal"], dtype=float).reshape(-1)
-        goal = np.array(obs["desired_goal"], dtype=float).reshape(-1)
-        effector = np.asarray(obs["observation"], dtype=float).reshape(-1)[self._effector]
-        return thing, goal, effector
+        thing, goal, observed = (np.array(obs[key], float).reshape(-1) for key in (*GOALS, "observation"))
+        return thing, goal, observed[self._effector]
 
     def _level(self, difference: Vector) -> Vector:
         """The part of `difference` perpendicular to the lift axis."""
@@ -83,7 +81,6 @@ class Pusher(Mover):
         return self._action(self._target(thing, effector, missing / distance, distance) - effector)
 
     def _target(self, thing: Vector, effector: Vector, way: Vector, distance: float) -> Vector:
-        """The effector's next target position."""
         touch = thing.copy()
         touch[self._lift] += self._depth
         offset = self._level(effector - thing)

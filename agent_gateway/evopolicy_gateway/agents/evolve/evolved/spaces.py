@@ -22,6 +22,7 @@ IMAGE_CELLS = 4
 """A picture becomes this many by this many mean colours."""
 MAX_ONE_HOT = 64
 """A Discrete space with more values than this becomes one number in [-1, 1]."""
+GOALS = ("achieved_goal", "desired_goal")
 MAX_CHOICES = 1024
 """An action of a Discrete space with more values than this is one output, on a scale on which low values have most
 room."""
@@ -30,21 +31,13 @@ room."""
 def bounds(schema: Schema) -> tuple[Vector, Vector]:
     """Lowest and highest value of every element of a Box, flat; infinite if unbounded."""
     size = math.prod(schema["shape"])
-    low, high = _floats(schema["low"]), _floats(schema["high"])
-    return np.broadcast_to(low, size).astype(float), np.broadcast_to(high, size).astype(float)
-
-
-def _floats(value: Any) -> list[float]:
-    if isinstance(value, list):
-        return [number for item in value for number in _floats(item)]
-    return [float(value)]
+    low, high = (np.asarray(schema[end], dtype=float).reshape(-1) for end in ("low", "high"))
+    return np.broadcast_to(low, size).copy(), np.broadcast_to(high, size).copy()
 
 
 def goal_keys(schema: Schema) -> bool:
     """Whether the space follows the goal convention: a Dict with `observation`, `achieved_goal` and `desired_goal`."""
-    return schema["type"] == "Dict" and {"observation", "achieved_goal", "desired_goal"} <= set(
-        schema["spaces"]
-    )
+    return schema["type"] == "Dict" and set(schema["spaces"]) >= {"observation", *GOALS}
 
 
 class Features:
@@ -67,7 +60,9 @@ def _features(schema: Schema) -> tuple[int, Callable[[Any], Vector]]:
         half = np.where(finite, (np.where(finite, high, 1.0) - np.where(finite, low, -1.0)) / 2, 1.0)
         return low.size, lambda obs: (np.asarray(obs, dtype=float).reshape(-1) - centre) / half
     if kind == "Image":
-        return _image_features(schema)
+        height, width, channels = as_image(np.zeros(schema["shape"]), schema).shape
+        n_cells = min(IMAGE_CELLS, height) * min(IMAGE_CELLS, width)
+        return n_cells * channels, lambda obs: _cells(obs, schema)
     if kind == "Discrete":
         n, start = schema["n"], schema.get("start", 0)
         if n > MAX_ONE_HOT:
@@ -84,39 +79,37 @@ def _features(schema: Schema) -> tuple[int, Callable[[Any], Vector]]:
         return size, lambda obs: 2.0 * np.asarray(obs, dtype=float).reshape(-1) - 1.0
     if kind in ("Text", "Sequence", "Graph", "OneOf"):
         return 0, lambda obs: np.zeros(0)
-    if kind == "Tuple":
-        return _joined([(i, part) for i, part in enumerate(schema["spaces"])])
-    if goal_keys(schema):
-        others = [(k, v) for k, v in schema["spaces"].items() if k not in ("achieved_goal", "desired_goal")]
-        size, convert = _joined(others)
-        n_goal = math.prod(schema["spaces"]["desired_goal"]["shape"])
-        return size + n_goal, lambda obs: np.concatenate([goal_error(obs), convert(obs)])
-    return _joined(list(schema["spaces"].items()))
+    goal = goal_keys(schema)
+    items = [(key, part) for key, part in _items(schema) if not (goal and key in GOALS)]
+    parts = [(key, *_features(part)) for key, part in items]
+    used = [(key, convert) for key, size, convert in parts if size]
+    n_goal = math.prod(schema["spaces"]["desired_goal"]["shape"]) if goal else 0
+
+    def join(obs: Any) -> Vector:
+        missing = goal_error(obs) if goal else np.zeros(0)
+        return np.concatenate([missing, *(convert(obs[key]) for key, convert in used)])
+
+    return n_goal + sum(size for _, size, _ in parts), join
+
+
+def _items(schema: Schema) -> list[tuple[Any, Schema]]:
+    """The parts of a Dict or Tuple."""
+    return list(schema["spaces"].items() if schema["type"] == "Dict" else enumerate(schema["spaces"]))
 
 
 def goal_error(obs: Any) -> Vector:
     """Difference to the goal: desired minus achieved goal, flat."""
-    desired = np.asarray(obs["desired_goal"], dtype=float).reshape(-1)
-    missing: Vector = desired - np.asarray(obs["achieved_goal"], dtype=float).reshape(-1)
+    achieved, desired = (np.asarray(obs[key], dtype=float).reshape(-1) for key in GOALS)
+    missing: Vector = desired - achieved
     return missing
 
 
-def _joined(items: list[tuple[Any, Schema]]) -> tuple[int, Callable[[Any], Vector]]:
-    parts = [(key, *_features(part)) for key, part in items]
-    used = [(key, convert) for key, size, convert in parts if size]
-    if not used:
-        return 0, lambda obs: np.zeros(0)
-    return sum(size for _, size, _ in parts), lambda obs: np.concatenate([f(obs[key]) for key, f in used])
-
-
-def _image_features(schema: Schema) -> tuple[int, Callable[[Any], Vector]]:
-    def convert(obs: Any) -> Vector:
-        image = as_image(obs, schema)
-        rows = np.array_split(image, min(IMAGE_CELLS, image.shape[0]), axis=0)
-        cells = [c for row in rows for c in np.array_split(row, min(IMAGE_CELLS, image.shape[1]), axis=1)]
-        return np.concatenate([cell.mean(axis=(0, 1)) for cell in cells])
-
-    return convert(np.zeros(schema["shape"])).size, convert
+def _cells(obs: Any, schema: Schema) -> Vector:
+    """The mean colours of a picture's cells."""
+    image = as_image(obs, schema)
+    rows = np.array_split(image, min(IMAGE_CELLS, image.shape[0]), axis=0)
+    cells = [c for row in rows for c in np.array_split(row, min(IMAGE_CELLS, image.shape[1]), axis=1)]
+    return np.concatenate([cell.mean(axis=(0, 1)) for cell in cells])
 
 
 def as_image(obs: Any, schema: Schema) -> NDArray[np.float64]:
@@ -145,7 +138,19 @@ class ActionHead:
 def _head(schema: Schema) -> tuple[int, Callable[[Vector], Any]]:
     kind = schema["type"]
     if kind == "Box":
-        return _box_head(schema)
+        low, high = bounds(schema)
+        neutral = np.clip(0.0, low, high)
+        up = np.where(np.isfinite(high), high - neutral, 1.0)
+        down = np.where(np.isfinite(low), neutral - low, 1.0)
+        dtype = np.dtype(schema["dtype"])
+
+        def scale(outputs: Vector) -> Any:
+            bounded = np.clip(outputs, -1.0, 1.0)
+            values = neutral + np.where(bounded > 0, bounded * up, bounded * down)
+            values = np.rint(values) if dtype.kind in "iu" else values
+            return np.clip(values, low, high).astype(dtype).reshape(schema["shape"])
+
+        return low.size, scale
     if kind == "Discrete":
         n, start = schema["n"], schema.get("start", 0)
         if n > MAX_CHOICES:
@@ -175,39 +180,19 @@ def _head(schema: Schema) -> tuple[int, Callable[[Vector], Any]]:
     if kind == "OneOf":
         size, convert = _head(schema["spaces"][0])
         return size, lambda outputs: (0, convert(outputs))
-    named = kind == "Dict"
-    items = list(schema["spaces"].items()) if named else list(enumerate(schema["spaces"]))
-    heads = [(key, *_head(part)) for key, part in items]
+    heads = [(key, *_head(part)) for key, part in _items(schema)]
     cuts = np.cumsum([size for _, size, _ in heads])[:-1]
 
     def compose(outputs: Vector) -> Any:
         pieces = np.split(outputs, cuts)
         made = [(key, convert(piece)) for (key, _, convert), piece in zip(heads, pieces, strict=True)]
-        return dict(made) if named else tuple(value for _, value in made)
+        return dict(made) if kind == "Dict" else tuple(value for _, value in made)
 
     return sum(size for _, size, _ in heads), compose
 
 
-def _box_head(schema: Schema) -> tuple[int, Callable[[Vector], Any]]:
-    low, high = bounds(schema)
-    neutral = np.clip(0.0, low, high)
-    up = np.where(np.isfinite(high), high - neutral, 1.0)
-    down = np.where(np.isfinite(low), neutral - low, 1.0)
-    dtype = np.dtype(schema["dtype"])
-    shape = tuple(schema["shape"])
-
-    def scale(outputs: Vector) -> Any:
-        bounded = np.clip(outputs, -1.0, 1.0)
-        values = neutral + np.where(bounded > 0, bounded * up, bounded * down)
-        if dtype.kind in "iu":
-            values = np.rint(values)
-        return np.clip(values, low, high).astype(dtype).reshape(shape)
-
-    return low.size, scale
-
-
 class Given(NamedTuple):
-    """What a controller is built with, besides its vector."""
+    """The parts of a controller besides its vector."""
 
     head: ActionHead
     obs_space: Schema
