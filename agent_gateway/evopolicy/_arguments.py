@@ -76,12 +76,18 @@ class Rule(NamedTuple):
     """Completes the sentence "give …"."""
 
 
-def _text(value: Any) -> str:
-    if not isinstance(value, str):
-        raise TypeError
-    if not value:
-        raise ValueError
-    return value
+def _checked(kind: type[Any], *, filled: bool = False) -> Callable[[Any], Any]:
+    """Takes values of a type; `filled`: not an empty one."""
+
+    def take(value: Any) -> Any:
+        if not isinstance(value, kind) or (filled and not value):
+            raise TypeError
+        return value
+
+    return take
+
+
+_text = _checked(str, filled=True)
 
 
 def _path(value: Any) -> Path:
@@ -108,12 +114,6 @@ def _least(least: float) -> Callable[[Any], float]:
     return take
 
 
-def _flag(value: Any) -> bool:
-    if not isinstance(value, bool):
-        raise TypeError
-    return value
-
-
 def _agent(value: Any) -> Any:
     return value if callable(value) else _text(value)
 
@@ -135,10 +135,8 @@ def _names(value: Any) -> tuple[str, ...]:
 
 
 def _limits(value: Any) -> ResourceLimits:
-    if not isinstance(value, Mapping):
+    if not isinstance(value, Mapping) or any(isinstance(number, str | bool) for number in value.values()):
         raise TypeError
-    if any(isinstance(number, str | bool) for number in value.values()):
-        raise ValueError
     return limits_from({_text(name): float(number) for name, number in value.items()}, "limits: ")
 
 
@@ -158,14 +156,11 @@ def _or_none(rule: Rule) -> Rule:
 
 
 _FOLDER = Rule(_path, "the path of a folder")
-_FLAG = Rule(_flag, "True or False")
-_NAME = Rule(_text, "a text")
-
-
+_FLAG = Rule(_checked(bool), "True or False")
 _KINDS = {
     bool: _FLAG,
     ResourceLimits: Rule(_limits, "a mapping of names to numbers, such as {'act_wall_s': 5}"),
-    str: _NAME,
+    str: Rule(_text, "a text"),
 }
 
 
@@ -190,12 +185,8 @@ def _rule(one: Declared) -> Rule:
 
 OPTIONS = {one.name: one for one in declared(run_options.RunOptions).values() if one.option.python}
 """The options of a run that Python has."""
-RunOptions.__doc__ = "\n".join(
-    [
-        f"{RunOptions.__doc__}\n",
-        *(f"`{one.name}`: {one.help}" for one in OPTIONS.values() if one.name != "agent"),
-    ]
-)
+_HELPS = (f"`{one.name}`: {one.help}" for one in OPTIONS.values() if one.name != "agent")
+RunOptions.__doc__ = "\n".join([f"{RunOptions.__doc__}\n", *_HELPS])
 RULES: dict[str, Rule] = {
     **{name: _rule(one) for name, one in OPTIONS.items()},
     "agent": Rule(_agent, "a function of one Workspace, or a text as for --agent, such as 'evolve'"),

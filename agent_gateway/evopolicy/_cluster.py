@@ -9,7 +9,7 @@ import importlib.util
 import os
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterable, Mapping
 from pathlib import Path
-from typing import Any, NamedTuple, Self, TypeVar, Unpack
+from typing import Any, Self, TypeVar, Unpack
 
 from rich.progress import Progress
 
@@ -46,6 +46,8 @@ AgentFunction = Callable[[Workspace], Any]
 PolicyFunction = Callable[[Any], Any]
 """Returns the action for an observation."""
 Limits = Mapping[str, float]
+Trial = tuple[Bundle, Evaluate]
+"""A policy, and the order to play it on train cases."""
 
 
 class Cluster:
@@ -85,10 +87,8 @@ class Cluster:
         given = taken(slots=slots, state=state, fresh=fresh, data=data, policy_packages=policy_packages)
         if fresh and state is not None:
             raise ConfigError(f"fresh and state {given['state']}: give only one of them")
-        if given["data"] is not None and not given["data"].is_dir():
-            raise ConfigError(
-                f"data {given['data']} is not a folder: give one that `evopolicy data make` wrote"
-            )
+        if (folder := given["data"]) is not None and not folder.is_dir():
+            raise ConfigError(f"data {folder} is not a folder: give one that `evopolicy data make` wrote")
         policy_versions(given["policy_packages"])
         chosen = run_options.ClusterOptions(
             slots=given["slots"],
@@ -222,14 +222,15 @@ class Cluster:
         return results[0]
 
     async def _evaluated(self, trial: Trial, progress: bool) -> Evaluation:
-        env, cases, bundle = trial.message.env, trial.message.cases or (), trial.bundle
+        bundle, message = trial
+        env, cases = message.env, message.cases or ()
 
         async def work(reached: operator.Reached) -> Evaluation:
             await reached.operations.upload(bundle.digest, bundle.packed)
             outcomes: list[EpisodeOutcome] = []
             with _bar(progress) as bar:
                 task = bar.add_task(env, total=len(cases))
-                async for outcome, _, _ in reached.operations.evaluate(trial.message):
+                async for outcome, _, _ in reached.operations.evaluate(message):
                     if outcome is not None:
                         outcomes.append(outcome)
                         bar.update(task, completed=len(outcomes))
@@ -240,7 +241,7 @@ class Cluster:
                 episodes.append(await asyncio.to_thread(episode_of, case, outcome, packed))
             return Evaluation(env, episodes)
 
-        return await self._on(env, trial.message.sandbox_tier, work)
+        return await self._on(env, message.sandbox_tier, work)
 
     async def _planned(
         self, stack: contextlib.ExitStack, env: str, agent: str | AgentFunction, options: RunOptions
@@ -272,13 +273,6 @@ class Cluster:
         return await self._on(plan.settings.env, plan.settings.sandbox_tier, work)
 
 
-class Trial(NamedTuple):
-    """A policy to be played on train cases."""
-
-    bundle: Bundle
-    message: Evaluate
-
-
 def trial_of(
     policy: AnyPath | PolicyFunction, env: str, cases: Iterable[int], tier: Tier, limits: Limits | None
 ) -> Trial:
@@ -290,7 +284,7 @@ def trial_of(
     folder = given["policy"]
     bundle = policy_of(folder) if callable(folder) else policy_bundle(shipped.found(folder, Path.cwd()))
     known = {"sandbox_tier": tier, "limits": given["limits"] or ResourceLimits()}
-    return Trial(bundle, evaluation(env, bundle.digest, "train", given["cases"], **known))
+    return bundle, evaluation(env, bundle.digest, "train", given["cases"], **known)
 
 
 def plan_of(
@@ -376,6 +370,5 @@ async def _opened(cluster: Cluster) -> AsyncIterator[Cluster]:
 def _bar(wanted: bool) -> Progress:
     console = terminal(stderr=True)
     widgets = console.is_jupyter and importlib.util.find_spec("ipywidgets") is not None
-    return Progress(
-        console=console, transient=True, disable=not wanted or not (console.is_terminal or widgets)
-    )
+    shown = wanted and (console.is_terminal or widgets)
+    return Progress(console=console, transient=True, disable=not shown)

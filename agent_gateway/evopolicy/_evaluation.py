@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import html
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,7 +12,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from evopolicy._records import Records, bars, table
+from evopolicy._records import Records, bars
 from evopolicy_common.messages.episode import EpisodeOutcome
 from evopolicy_common.records.aggregates import mean
 from evopolicy_common.records.episodes.trajectory import decode
@@ -72,15 +72,11 @@ class Evaluation(Sequence[Episode]):
     def __len__(self) -> int:
         return len(self.episodes)
 
-    def __iter__(self) -> Iterator[Episode]:
-        return iter(self.episodes)
-
     @property
     def returns(self) -> NDArray[np.float64]:
         """float64, shape (episodes,); NaN for episodes that were not played."""
-        return np.array(
-            [math.nan if one.episode_return is None else one.episode_return for one in self.episodes]
-        )
+        returns = [one.episode_return for one in self.episodes]
+        return np.array([math.nan if value is None else value for value in returns])
 
     @property
     def lengths(self) -> NDArray[np.int64]:
@@ -90,11 +86,8 @@ class Evaluation(Sequence[Episode]):
     @property
     def mean_return(self) -> float | None:
         """Mean over the cases in which the policy did not fail; None when there are none."""
-        known = [
-            one.episode_return
-            for one in self.episodes
-            if one.failure is None and one.episode_return is not None
-        ]
+        returns = [one.episode_return for one in self.episodes if one.failure is None]
+        known = [value for value in returns if value is not None]
         return mean(known) if known else None
 
     @property
@@ -117,10 +110,8 @@ class Evaluation(Sequence[Episode]):
         return f"<Evaluation of {self.env}: {len(self)} episodes, mean return {mean}>"
 
     def _repr_html_(self) -> str:
-        shown = self.records
-        rows = [[getattr(one, name) for name in shown.columns] for one in shown]
         plot = bars([one.episode_return for one in self.episodes], "returns")
-        return f"<p>{html.escape(repr(self))}</p>{plot}{table(shown.columns, rows)}"
+        return f"<p>{html.escape(repr(self))}</p>{plot}{self.records._table()}"
 
 
 def episode_of(case: int, outcome: EpisodeOutcome, packed: bytes | None) -> Episode:

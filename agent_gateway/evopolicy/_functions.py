@@ -75,7 +75,10 @@ def _pickled(function: Callable[..., Any], role: str, place: str) -> bytes:
 
     # The place cannot import modules from outside site-packages, so the function's module is pickled with it.
     module = sys.modules.get(getattr(function, "__module__", None) or "")
-    by_value = module is not None and module.__name__ != "__main__" and not _is_installed(module)
+    # Neither part of Python nor of a package in site-packages.
+    parts = Path(getattr(module, "__file__", None) or "").parts
+    own = parts and not {"site-packages", "dist-packages"} & set(parts)
+    by_value = module is not None and module.__name__ != "__main__" and own
     if by_value:
         cloudpickle.register_pickle_by_value(module)
     try:
@@ -85,9 +88,3 @@ def _pickled(function: Callable[..., Any], role: str, place: str) -> bytes:
     finally:
         if by_value:
             cloudpickle.unregister_pickle_by_value(module)
-
-
-def _is_installed(module: Any) -> bool:
-    """Whether the module is part of Python or of a package in site-packages."""
-    place = getattr(module, "__file__", None)
-    return place is None or any(part in ("site-packages", "dist-packages") for part in Path(place).parts)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import html
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import Any, Generic, TypeVar, overload
 
 import msgspec
@@ -35,9 +35,6 @@ class Records(Sequence[R], Generic[R]):
     def __len__(self) -> int:
         return len(self._records)
 
-    def __iter__(self) -> Iterator[R]:
-        return iter(self._records)
-
     def __repr__(self) -> str:
         return f"<{len(self)} {self._kind.__name__}>"
 
@@ -53,7 +50,7 @@ class Records(Sequence[R], Generic[R]):
 
     def to_dicts(self) -> list[dict[str, Any]]:
         """One dict per record."""
-        return [{name: getattr(one, name) for name in self.columns} for one in self]
+        return [msgspec.structs.asdict(one) for one in self]
 
     def to_pandas(self) -> Any:
         """Returns a pandas.DataFrame. Raises ModuleNotFoundError when pandas is not installed."""
@@ -68,18 +65,16 @@ class Records(Sequence[R], Generic[R]):
         return polars.DataFrame({name: [getattr(one, name) for one in self] for name in self.columns})
 
     def _repr_html_(self) -> str:
-        return table(self.columns, [[getattr(one, name) for name in self.columns] for one in self])
+        return self._table()
 
-
-def table(columns: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:
-    """Returns an HTML table of the first 20 rows."""
-    head = "".join(f"<th>{html.escape(name)}</th>" for name in columns)
-    body = "".join(
-        "<tr>" + "".join(f"<td>{html.escape(_text(cell))}</td>" for cell in row) + "</tr>"
-        for row in rows[:_SHOWN]
-    )
-    more = f"<p>… {len(rows) - _SHOWN} more rows</p>" if len(rows) > _SHOWN else ""
-    return f"<table><tr>{head}</tr>{body}</table>{more}"
+    def _table(self, first: int = 0) -> str:
+        """Returns an HTML table of the first 20 rows. `first`: the first column."""
+        columns = self.columns[first:]
+        head = "".join(f"<th>{html.escape(name)}</th>" for name in columns)
+        rows = [[html.escape(_text(getattr(one, name))) for name in columns] for one in self[:_SHOWN]]
+        body = "".join("<tr>" + "".join(f"<td>{cell}</td>" for cell in row) + "</tr>" for row in rows)
+        more = f"<p>… {len(self) - _SHOWN} more rows</p>" if len(self) > _SHOWN else ""
+        return f"<table><tr>{head}</tr>{body}</table>{more}"
 
 
 def _text(value: Any) -> str:

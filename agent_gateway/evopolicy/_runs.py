@@ -12,7 +12,7 @@ from typing import Any
 import msgspec
 
 from evopolicy._arguments import take
-from evopolicy._records import Records, bars, table
+from evopolicy._records import Records, bars
 from evopolicy_common.errors import DECODE_ERRORS, ConfigError, ProtocolError
 from evopolicy_common.records.run_files import no_run_below, read_record, run_folders, submit_folders
 from evopolicy_common.records.run_record import RunRecord
@@ -142,13 +142,20 @@ class Run:
         An agent can write anything to this file. Raises ConfigError when it is not a regular file, not JSON, or over 1
         MiB.
         """
-        data = _bounded(self.folder / "workspace" / RESULT)
-        if data is None:
-            return None
+        path = self.folder / "workspace" / RESULT
         try:
+            with open_regular(path) as file:
+                data = file.read(_MAX_RESULT_BYTES + 1)
+            if len(data) > _MAX_RESULT_BYTES:
+                most = f"{_MAX_RESULT_BYTES:,} bytes, the most that an agent function may return"
+                raise ConfigError(f"{path} is larger than {most}")
             return msgspec.json.decode(data)
+        except FileNotFoundError:
+            return None
+        except OSError as error:
+            raise ConfigError(f"{path} is no regular file: {error.strerror}") from error
         except DECODE_ERRORS as error:
-            raise ConfigError(f"{self.folder}/workspace/{RESULT} is no JSON: {error}") from error
+            raise ConfigError(f"{path} is no JSON: {error}") from error
 
     @property
     def submits(self) -> Records[SubmitRecord]:
@@ -203,8 +210,7 @@ class Run:
     def _repr_html_(self) -> str:
         shown = self.submits
         plot = bars([one.mean_return for one in shown], "mean return of each submit")
-        rows = [[getattr(one, name) for name in shown.columns[3:]] for one in shown]
-        return f"<p>{html.escape(repr(self))}</p>{plot}{table(shown.columns[3:], rows)}{self._video()}"
+        return f"<p>{html.escape(repr(self))}</p>{plot}{shown._table(3)}{self._video()}"
 
     def _video(self) -> str:
         for path in self.replays[:1]:
@@ -227,9 +233,6 @@ class Runs(Sequence[Run]):
 
     def __len__(self) -> int:
         return len(self._runs)
-
-    def __iter__(self) -> Iterator[Run]:
-        return iter(self._runs)
 
     def summaries(self) -> Records[RunSummary]:
         """One row per run."""
@@ -284,19 +287,3 @@ def summaries_in(feedback: Path) -> Iterator[Summary]:
             yield decode_summary(read_regular(folder / "summary.json"))
         except FileNotFoundError:
             continue
-
-
-def _bounded(path: Path) -> bytes | None:
-    """Reads a regular file that an agent may have written; None when missing. Raises ConfigError for anything else."""
-    try:
-        with open_regular(path) as file:
-            data = file.read(_MAX_RESULT_BYTES + 1)
-    except FileNotFoundError:
-        return None
-    except OSError as error:
-        raise ConfigError(f"{path} is no regular file: {error.strerror}") from error
-    if len(data) > _MAX_RESULT_BYTES:
-        raise ConfigError(
-            f"{path} is larger than {_MAX_RESULT_BYTES:,} bytes, the most that an agent function may return"
-        )
-    return data

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
-from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
@@ -23,17 +22,7 @@ if TYPE_CHECKING:
 app = App()
 
 
-class Format(StrEnum):
-    """The name of a format."""
-
-    CSV = "csv"
-    PARQUET = "parquet"
-    TENSORBOARD = "tensorboard"
-    MLFLOW = "mlflow"
-    WANDB = "wandb"
-    MINARI = "minari"
-    ATIF = "atif"
-    INSPECT = "inspect"
+Format = Literal["csv", "parquet", "tensorboard", "mlflow", "wandb", "minari", "atif", "inspect"]
 
 
 @app.command("export", epilog="Example: evopolicy export runs/ --to parquet --out tables")
@@ -68,7 +57,7 @@ def export(
         if follow and to not in _TRACKERS:
             raise ConfigError(f"--follow: {to} is written at once; {', '.join(_TRACKERS)} can follow")
         default = f"export-{to}"
-        if to is Format.MLFLOW:
+        if to == "mlflow":
             default = os.environ.get("MLFLOW_TRACKING_URI") or f"sqlite:///{default}.db"
         try:
             if to in _TRACKERS:
@@ -93,11 +82,11 @@ def _write(runs: list[Path], to: Format, out: Path) -> None:
     from evopolicy._exports import tables, trajectories, transcripts
 
     writers: dict[Format, Callable[[Runs, Path], list[Path]]] = {
-        Format.CSV: tables.write_csv,
-        Format.PARQUET: tables.write_parquet,
-        Format.MINARI: trajectories.write_minari,
-        Format.ATIF: transcripts.write_atif,
-        Format.INSPECT: transcripts.write_inspect,
+        "csv": tables.write_csv,
+        "parquet": tables.write_parquet,
+        "minari": trajectories.write_minari,
+        "atif": transcripts.write_atif,
+        "inspect": transcripts.write_inspect,
     }
     runs_read = load_runs(*runs)
     for folder, why in runs_read.left_out:
@@ -110,12 +99,9 @@ def _write(runs: list[Path], to: Format, out: Path) -> None:
 def _track(runs: list[Path], to: Format, out: str, follow: bool) -> None:
     from evopolicy._exports import tracking
 
-    for name in tracking.track(runs, _TRACKERS[to](tracking, out), follow=follow):
+    for name in tracking.track(runs, getattr(tracking, _TRACKERS[to])(out), follow=follow):
         say_lines([name])
 
 
-_TRACKERS: dict[Format, Callable[[Any, str], Any]] = {
-    Format.TENSORBOARD: lambda tracking, out: tracking.TensorBoard(Path(out)),
-    Format.MLFLOW: lambda tracking, out: tracking.MLflow(out),
-    Format.WANDB: lambda tracking, out: tracking.WeightsAndBiases(Path(out)),
-}
+_TRACKERS = {"tensorboard": "TensorBoard", "mlflow": "MLflow", "wandb": "WeightsAndBiases"}
+"""Classes of `tracking`, each of which takes --out."""

@@ -114,10 +114,8 @@ class _Log:
             self._message(message, at, by_agent=kind == "assistant")
         elif kind == "item.completed" and isinstance(event.get("item"), dict):
             self._item(event["item"], at)
-        elif kind == "stdout" and isinstance(text, str):
-            self.step("agent", "stdout", at).texts.append(text)
-        elif kind == "stderr" and isinstance(text, str):
-            self.step("system", "stderr", at).texts.append(text)
+        elif kind in ("stdout", "stderr") and isinstance(text, str):
+            self.step("agent" if kind == "stdout" else "system", kind, at).texts.append(text)
         elif kind in _NOTES:
             fields = {name: value for name, value in event.items() if name not in ("type", "timestamp")}
             self.step("system", at=at).texts.append(f"{kind}: {_json(fields)}")
@@ -147,16 +145,12 @@ class _Log:
     def _item(self, item: dict[str, Any], at: str | None) -> None:
         """A completed item of Codex: a message, reasoning, or a call together with its result."""
         kind = item.get("type") or item.get("item_type")
-        if kind in ("agent_message", "assistant_message"):
-            self.step("agent", at=at).texts.append(_text(item.get("text")))
-            return
-        if kind == "reasoning":
-            self.step("agent", at=at).reasoning.append(_text(item.get("text")))
-            return
         identity = item.get("id")
         failed = item.get("status") == "failed" or item.get("exit_code") not in (0, None)
         step = self.step("agent", at=at)
-        if kind == "command_execution":
+        if kind in ("agent_message", "assistant_message", "reasoning"):
+            (step.reasoning if kind == "reasoning" else step.texts).append(_text(item.get("text")))
+        elif kind == "command_execution":
             self.call(step, identity, "shell", {"command": item.get("command")})
             self.result(identity, item.get("aggregated_output"), failed)
         elif kind == "mcp_tool_call":
@@ -188,10 +182,8 @@ class _Log:
 
 def _text(value: Any, depth: int = 0) -> str:
     """A text, or the texts within content blocks; anything else as JSON."""
-    if value is None:
-        return ""
-    if isinstance(value, str):
-        return value
+    if value is None or isinstance(value, str):
+        return value or ""
     if isinstance(value, list) and depth < _MAX_DEPTH:
         return "\n".join(_text(one, depth + 1) for one in value)
     if isinstance(value, dict) and depth < _MAX_DEPTH:

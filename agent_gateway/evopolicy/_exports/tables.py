@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import os
 from collections.abc import Iterator
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,14 @@ def names(runs: Runs) -> dict[str, str]:
     folders = [run.folder for run in runs]
     common = os.path.commonpath([(folder, *folder.parents)[:4][-1] for folder in folders]) if folders else ""
     return {str(folder): os.path.relpath(folder, common) for folder in folders}
+
+
+def time_of(text: str) -> datetime:
+    """1970 for a text that is no time: one damaged file must not end the export of all other runs."""
+    try:
+        return datetime.fromisoformat(text).astimezone(UTC)
+    except (ValueError, OverflowError):
+        return datetime.fromtimestamp(0, UTC)
 
 
 def _tables(runs: Runs) -> Iterator[tuple[str, Records[Any], list[dict[str, Any]]]]:

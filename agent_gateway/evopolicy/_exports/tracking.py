@@ -16,13 +16,13 @@ import os
 import socket
 import time
 from collections.abc import Iterator
-from datetime import datetime
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 from urllib.parse import urlsplit
 
 import msgspec
 
+from evopolicy._exports.tables import time_of
 from evopolicy._runs import summaries_in
 from evopolicy_common.errors import DECODE_ERRORS, ConfigError, ProtocolError
 from evopolicy_common.records.blobs import write_atomically
@@ -106,7 +106,7 @@ class Tracker(Protocol):
 def track(paths: list[Path], tracker: Tracker, *, follow: bool) -> Iterator[str]:
     """Sends runs to a tracker, and yields the name of each that is finished.
 
-    With `follow` it continues until every run that is found, and every run of a sweep whose folder is given, is
+    With `follow` it continues until every run below the paths, and every run of a sweep whose folder is given, is
     finished; the first may appear later. Raises ConfigError when there is no run and `follow` is off, and for a damaged
     record.
     """
@@ -149,16 +149,21 @@ def _awaited(paths: list[Path]) -> bool:
 def _send(curve: Curve, tracker: Tracker) -> None:
     if curve.known == 0 or (known := tracker.n_known(curve)) < 0:
         return
-    points = list(_points(curve.summaries))[known:]
-    if curve.record is not None:
-        points += _hidden(curve.record, curve.summaries)
-    if points:
+    seen, hidden = _points(curve)
+    if points := seen[known:] + hidden:
         tracker.add(curve, points)
 
 
-def _points(summaries: list[Summary]) -> Iterator[Point]:
+def _points(curve: Curve) -> tuple[list[Point], list[Point]]:
+    """A point for each submit, and the hidden scores of a finished run: each validation score at its submit, the
+    held-out score at the end."""
+    record = curve.record
+    ended = 0.0 if record is None else time_of(record.timing.end_time).timestamp()
+    scores = (record.outcome.val_scores if record is not None else None) or {}
+    seen: list[Point] = []
+    hidden: list[Point] = []
     spent = 0
-    for one in summaries:
+    for one in curve.summaries:
         spent += one.n_episodes
         metrics = {
             "train/mean_return": one.mean_return,
@@ -171,36 +176,21 @@ def _points(summaries: list[Summary]) -> Iterator[Point]:
             "submit/wall_s": one.wall_time_seconds,
             "budget/remaining": one.remaining_budget,
         }
-        yield Point(spent, _unix(one.submit_completed_at), _finite(metrics))
-
-
-def _hidden(record: RunRecord, summaries: list[Summary]) -> list[Point]:
-    """The hidden scores of a finished run: each validation score at its submit, the held-out score at the end."""
-    ended = _unix(record.timing.end_time)
-    spent, points = 0, []
-    for one in summaries:
-        spent += one.n_episodes
-        score = (record.outcome.val_scores or {}).get(str(one.submit_index))
-        if score is not None:
-            points.append(Point(spent, ended, _finite({"validation/mean_return": score})))
-    metrics = {"heldout/mean_return": record.outcome.score, "random/mean_return": record.outcome.random_score}
-    if (tokens := record.agent.tokens) is not None:
-        metrics |= {"agent/output_tokens": tokens.output, "agent/cost_usd": tokens.cost}
-    points.append(Point(spent, ended, _finite(metrics)))
-    return points
+        seen.append(Point(spent, time_of(one.submit_completed_at).timestamp(), _finite(metrics)))
+        if (score := scores.get(str(one.submit_index))) is not None:
+            hidden.append(Point(spent, ended, _finite({"validation/mean_return": score})))
+    if record is not None:
+        outcome, tokens = record.outcome, record.agent.tokens
+        metrics = {"heldout/mean_return": outcome.score, "random/mean_return": outcome.random_score}
+        if tokens is not None:
+            metrics |= {"agent/output_tokens": tokens.output, "agent/cost_usd": tokens.cost}
+        hidden.append(Point(spent, ended, _finite(metrics)))
+    return seen, hidden
 
 
 def _finite(metrics: dict[str, Any]) -> dict[str, float]:
     known = {name: float(value) for name, value in metrics.items() if value is not None}
     return {name: value for name, value in known.items() if math.isfinite(value)}
-
-
-def _unix(text: str) -> float:
-    """0 for a text that is no time: one damaged file must not end the export of all other runs."""
-    try:
-        return datetime.fromisoformat(text).timestamp()
-    except (ValueError, OverflowError):
-        return 0.0
 
 
 def _curve(folder: Path) -> Curve:
@@ -229,41 +219,47 @@ def _read_known(path: Path) -> _Known:
         raise ConfigError(f"{path} is damaged: {error}; choose another --out") from error
 
 
-def _write_known(path: Path, curve: Curve) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    write_atomically(path, msgspec.json.encode(_Known(run=curve.id, submits=curve.known)))
+class _Files:
+    """A tracker that writes below `out` and cannot be asked: a file of ours has the number of a run's submits."""
 
+    def __init__(self, out: str) -> None:
+        self._out = Path(out)
+        self._open: dict[str, Any] = {}
 
-class TensorBoard:
-    """Event files, one folder a run, below `out`."""
-
-    def __init__(self, out: Path) -> None:
-        self._out = out
-        self._writers: dict[str, Any] = {}
-
-    def _folder(self, curve: Curve) -> Path:
-        """Named as the run; with a part of its id where another run of that name has been before."""
-        usual = self._out / curve.name
-        own = _read_known(usual / _KNOWN).run in ("", curve.id)
-        return usual if own else usual.with_name(f"{usual.name}-{curve.id[:8]}")
+    def _known(self, curve: Curve) -> Path:
+        return self._out / "evopolicy" / f"{curve.id}.json"
 
     def n_known(self, curve: Curve) -> int:
-        """Read from the file `evopolicy.json` beside the events."""
-        return _read_known(self._folder(curve) / _KNOWN).submits
+        return _read_known(self._known(curve)).submits
+
+    def _save_known(self, curve: Curve) -> None:
+        path = self._known(curve)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_atomically(path, msgspec.json.encode(_Known(run=curve.id, submits=curve.known)))
+
+
+class TensorBoard(_Files):
+    """Event files, one folder a run, below `out`."""
+
+    def _known(self, curve: Curve) -> Path:
+        """Beside the events, in a folder named as the run; with a part of its id where another run of that name was."""
+        usual = self._out / curve.name
+        own = _read_known(usual / _KNOWN).run in ("", curve.id)
+        return (usual if own else usual.with_name(f"{usual.name}-{curve.id[:8]}")) / _KNOWN
 
     def add(self, curve: Curve, points: list[Point]) -> None:
         """Appends scalars to the run's event file."""
         from tensorboardX import SummaryWriter
 
-        folder = self._folder(curve)
-        if curve.id not in self._writers:
-            self._writers[curve.id] = SummaryWriter(str(folder))
+        if curve.id not in self._open:
+            folder = self._known(curve).parent
+            self._open[curve.id] = SummaryWriter(str(folder))
             # tensorboardX puts the host's name at the end of the file's.
             host = f".{socket.gethostname()}"
             for path in folder.glob("events.out.tfevents.*"):
                 if path.name.endswith(host):
                     path.rename(path.with_name(path.name.removesuffix(host)))
-        writer = self._writers[curve.id]
+        writer = self._open[curve.id]
         for point in points:
             for name, value in point.metrics.items():
                 writer.add_scalar(name, value, point.step, walltime=point.time_s)
@@ -271,14 +267,14 @@ class TensorBoard:
             table = "".join(f"| {name} | {value} |\n" for name, value in curve.settings().items())
             writer.add_text("settings", "| setting | value |\n|---|---|\n" + table)
         writer.flush()
-        _write_known(folder / _KNOWN, curve)
+        self._save_known(curve)
         if curve.record is not None:
-            self._writers.pop(curve.id).close()
+            self._open.pop(curve.id).close()
 
     def close(self) -> None:
         """Closes the files of runs that are still open."""
-        while self._writers:
-            self._writers.popitem()[1].close()
+        while self._open:
+            self._open.popitem()[1].close()
 
 
 class MLflow:
@@ -301,23 +297,19 @@ class MLflow:
         self._experiment = experiment.experiment_id if experiment else self._client.create_experiment(name)
         self._runs: dict[str, Any] = {}
 
-    def _find(self, curve: Curve) -> Any:
-        if curve.id not in self._runs:
-            matches = self._client.search_runs([self._experiment], f"tags.`evopolicy.id` = '{curve.id}'")
-            if matches:
-                self._runs[curve.id] = matches[0]
-        return self._runs.get(curve.id)
-
     def n_known(self, curve: Curve) -> int:
         """From the run's tag `evopolicy.submits`."""
-        run = self._find(curve)
+        if curve.id not in self._runs:
+            matches = self._client.search_runs([self._experiment], f"tags.`evopolicy.id` = '{curve.id}'")
+            self._runs[curve.id] = matches[0] if matches else None
+        run = self._runs[curve.id]
         return 0 if run is None else int(run.data.tags.get("evopolicy.submits", 0))
 
     def add(self, curve: Curve, points: list[Point]) -> None:
         """Logs metrics, and parameters once the run is finished."""
         from mlflow.entities import Metric, Param, RunTag
 
-        run = self._find(curve)
+        run = self._runs[curve.id]  # `n_known` was asked before
         if run is None:
             tags = {"evopolicy.id": curve.id}
             run = self._client.create_run(self._experiment, run_name=curve.name, tags=tags)
@@ -337,22 +329,11 @@ class MLflow:
         self._runs[curve.id] = self._client.get_run(run.info.run_id)
 
     def close(self) -> None:
-        """Nothing is left to write."""
+        """Nothing remains to be written."""
 
 
-class WeightsAndBiases:
+class WeightsAndBiases(_Files):
     """Runs of a project named `evopolicy`, or by WANDB_PROJECT. WANDB_MODE=offline writes below `out` only."""
-
-    def __init__(self, out: Path) -> None:
-        self._out = out
-        self._open: dict[str, Any] = {}
-
-    def _known(self, curve: Curve) -> Path:
-        return self._out / "evopolicy" / f"{curve.id}.json"
-
-    def n_known(self, curve: Curve) -> int:
-        """Read from a file below `out`: an offline run cannot be asked."""
-        return _read_known(self._known(curve)).submits
 
     def add(self, curve: Curve, points: list[Point]) -> None:
         """Logs metrics over `budget/spent`, and the settings."""
@@ -378,10 +359,9 @@ class WeightsAndBiases:
         run.config.update(curve.settings(), allow_val_change=True)
         for point in points:
             run.log(point.metrics | {"budget/spent": point.step})
-        _write_known(self._known(curve), curve)
+        self._save_known(curve)
         if curve.record is not None:
-            run.finish(exit_code=0 if curve.completed else 1)
-            del self._open[curve.id]
+            self._open.pop(curve.id).finish(exit_code=0 if curve.completed else 1)
 
     def close(self) -> None:
         """Ends the connections of runs that are still open; a later call resumes them."""

@@ -49,15 +49,10 @@ def write_minari(runs: Runs, out: Path) -> list[Path]:
     for name, members in groups.items():
         if (out / name).exists():
             raise ConfigError(f"{out / name} is there already; remove it, or choose another --out")
-        buffers: list[Any] = []
-        about: list[dict[str, Any]] = []
-        for run in members:
-            for buffer, metadata in _episodes(run, known_as[str(run.folder)]):
-                buffers.append(buffer)
-                about.append(metadata)
-        if not buffers:
+        episodes = [each for run in members for each in _episodes(run, known_as[str(run.folder)])]
+        if not episodes:
             continue
-        buffers, about = _of_one_form(buffers, about)
+        buffers, about = _of_one_form(episodes)
         first = members[0].summary
         with warnings.catch_warnings():
             # Minari warns of an author, a link and an environment that runs do not name.
@@ -81,15 +76,20 @@ def write_minari(runs: Runs, out: Path) -> list[Path]:
     return written
 
 
-def _of_one_form(buffers: list[Any], about: list[dict[str, Any]]) -> tuple[list[Any], list[dict[str, Any]]]:
-    """The episodes whose values have the most common form; the others, whose policy returned something else, are
-    named."""
-    forms = [str((_form(each.observations), _form(each.actions))) for each in buffers]
+def _of_one_form(episodes: list[tuple[Any, dict[str, Any]]]) -> tuple[list[Any], list[dict[str, Any]]]:
+    """The episodes whose values have the most common form, renumbered; the others, whose policy returned something
+    else, are named."""
+    forms = [str((_form(buffer.observations), _form(buffer.actions))) for buffer, _ in episodes]
     usual = Counter(forms).most_common(1)[0][0]
-    kept = [index for index, form in enumerate(forms) if form == usual]
-    for index in sorted({*range(len(forms))} - {*kept}):
-        _left_out(about[index], "its values have another form than those of the other episodes")
-    return [replace(buffers[old], id=new) for new, old in enumerate(kept)], [about[index] for index in kept]
+    buffers: list[Any] = []
+    kept: list[dict[str, Any]] = []
+    for (buffer, about), form in zip(episodes, forms, strict=True):
+        if form == usual:
+            buffers.append(replace(buffer, id=len(buffers)))
+            kept.append(about)
+        else:
+            _left_out(about, "its values have another form than those of the other episodes")
+    return buffers, kept
 
 
 def _form(columns: Any) -> Any:
@@ -124,19 +124,15 @@ def _episodes(run: Run, name: str) -> Iterator[tuple[Any, dict[str, Any]]]:
                 "submit": submit.submit,
                 "episode": episode,
                 "policy_mean_return": submit.mean_return,
-                "case": None if known is None else known.case,
-                "episode_return": None if known is None else known.episode_return,
-                "failed": None if known is None else known.failed,
+                **{field: getattr(known, field, None) for field in ("case", "episode_return", "failed")},
             }
+            pictures = [path.with_name(f"observations.{kind}") for kind in ("npz", "npy")]
             try:
                 rows = list(_rows(path))
-                pictures = path.with_name("observations.npz")
-                if not pictures.is_file():
-                    pictures = path.with_name("observations.npy")
                 if rows and rows[0].obs is not None:
                     columns = _columns([row.obs for row in rows])
-                elif rows and pictures.is_file():
-                    columns = read_arrays(read_regular(pictures, MAX_OBSERVATIONS_BYTES), MAX_BYTES)
+                elif rows and (stored := [one for one in pictures if one.is_file()]):
+                    columns = read_arrays(read_regular(stored[0], MAX_OBSERVATIONS_BYTES), MAX_BYTES)
                     if list(columns) in ([""], ["observations"]):
                         (columns,) = columns.values()
                 else:
@@ -145,16 +141,14 @@ def _episodes(run: Run, name: str) -> Iterator[tuple[Any, dict[str, Any]]]:
             except (TypeError, ValueError, KeyError, OverflowError):
                 _left_out(about, "it has values without a fixed form, such as actions of several kinds")
                 continue
-            yield (
-                EpisodeBuffer(
-                    observations=_repeat_last(columns),
-                    actions=actions,
-                    rewards=[row.reward for row in rows],
-                    terminations=[row.terminated for row in rows],
-                    truncations=[row.truncated for row in rows],
-                ),
-                about,
+            buffer = EpisodeBuffer(
+                observations=_repeat_last(columns),
+                actions=actions,
+                rewards=[row.reward for row in rows],
+                terminations=[row.terminated for row in rows],
+                truncations=[row.truncated for row in rows],
             )
+            yield buffer, about
 
 
 class _Row(NamedTuple):
@@ -187,9 +181,7 @@ def _packed(value: Any) -> Any:
 
 
 def _number(value: Any) -> float:
-    return float(
-        {"NaN": "nan", "Inf": "inf", "-Inf": "-inf"}.get(value, value) if isinstance(value, str) else value
-    )
+    return float(value)  # also of `NaN`, `Inf` and `-Inf`
 
 
 def _columns(values: list[Any]) -> Any:
@@ -206,9 +198,7 @@ def _columns(values: list[Any]) -> Any:
         if not all(isinstance(value, str) for value in values):
             raise TypeError("not only texts")
         return list(values)
-    if isinstance(first, bool) or (
-        isinstance(first, int) and all(isinstance(value, int) for value in values)
-    ):
+    if isinstance(first, bool) or all(isinstance(value, int) for value in values):
         return np.asarray(values, dtype=np.int64)
     if isinstance(first, np.ndarray):
         return np.stack(values)

@@ -7,13 +7,13 @@ import hashlib
 import json
 import re
 from collections.abc import Callable, Iterator
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 import msgspec
 
 from evopolicy._exports.steps import LogStep, read_steps
+from evopolicy._exports.tables import time_of
 from evopolicy._runs import Run, Runs
 from evopolicy_common.records import secrets
 
@@ -21,8 +21,6 @@ ATIF = "ATIF-v1.7"
 """The version of the format that is written."""
 INSPECT = 2
 """The version of Inspect's log format that is written, as JSON."""
-_STATES = {"cancelled": "cancelled", "error": "error"}
-"""Inspect's state of a log by the run's status; any other is a success."""
 _MAX_NAME = 100
 """Characters of an environment's name in a file's name."""
 _MAX_ERROR = 500
@@ -31,7 +29,7 @@ _MAX_ERROR = 500
 
 def write_atif(runs: Runs, out: Path) -> list[Path]:
     """Writes `<entry>/<env>/<experiment>/trajectory.json` for each run, over existing files."""
-    return [*_each(runs, _atif, lambda run: out / _name(run) / "trajectory.json")]
+    return _written(runs, _atif, lambda run: out / _name(run) / "trajectory.json")
 
 
 def write_inspect(runs: Runs, out: Path) -> list[Path]:
@@ -39,27 +37,24 @@ def write_inspect(runs: Runs, out: Path) -> list[Path]:
 
     def path(run: Run) -> Path:
         # Inspect lists the JSON files whose names begin with a time, and shows the next parts as task and id.
-        begun = _utc(run._record.timing.start_time).strftime("%Y-%m-%dT%H-%M-%S+00-00")
+        begun = time_of(run._record.timing.start_time).strftime("%Y-%m-%dT%H-%M-%S+00-00")
         task = re.sub(r"[^A-Za-z0-9]+", "-", run.summary.env[:_MAX_NAME])
         return out / f"{begun}_{task}_{_id(run)}.json"
 
-    return [*_each(runs, _inspect, path)]
+    return _written(runs, _inspect, path)
 
 
-def _each(
+def _written(
     runs: Runs, made: Callable[[Run, list[LogStep]], dict[str, Any]], path_of: Callable[[Run], Path]
-) -> Iterator[Path]:
-    for run in runs:
-        steps = read_steps(run.folder / "logs" / "agent.jsonl") or [_nothing()]
-        path = path_of(run)
+) -> list[Path]:
+    paths = [path_of(run) for run in runs]
+    nothing = LogStep(source="system", texts=["The agent's log holds no messages."])
+    for run, path in zip(runs, paths, strict=True):
+        steps = read_steps(run.folder / "logs" / "agent.jsonl") or [nothing]
         path.parent.mkdir(parents=True, exist_ok=True)
         data = json.dumps(made(run, steps), ensure_ascii=True, indent=1).encode()
         path.write_bytes(secrets.redacted(data, secrets.read_passed(run.folder)))
-        yield path
-
-
-def _nothing() -> LogStep:
-    return LogStep(source="system", texts=["The agent's log holds no messages."])
+    return paths
 
 
 def _name(run: Run) -> str:
@@ -71,14 +66,6 @@ def _id(run: Run) -> str:
     """22 hexadecimal digits; equal in every export of this run."""
     identity = f"{run.folder.absolute()} {run._record.timing.start_time}"
     return hashlib.sha256(identity.encode("utf-8", "surrogateescape")).hexdigest()[:22]
-
-
-def _utc(text: str) -> datetime:
-    """1970 for a text that is no time: one damaged run.json must not end the export of all others."""
-    try:
-        return datetime.fromisoformat(text).astimezone(UTC)
-    except (ValueError, OverflowError):
-        return datetime.fromtimestamp(0, UTC)
 
 
 def _about(run: Run) -> dict[str, Any]:
@@ -138,9 +125,9 @@ def _atif_step(number: int, step: LogStep) -> dict[str, Any]:
 
 
 def _inspect(run: Run, steps: list[LogStep]) -> dict[str, Any]:
-    record, summary = run._record, run.summary
+    record, summary, harness = run._record, run.summary, run._record.agent.harness
     model = record.agent.model_string or record.model
-    begun, ended = (_utc(text).isoformat() for text in (record.timing.start_time, record.timing.end_time))
+    begun, ended = (time_of(text).isoformat() for text in (record.timing.start_time, record.timing.end_time))
     messages = [message for step in steps for message in _inspect_messages(step, model)]
     last = next((each for each in reversed(messages) if each["role"] == "assistant"), None)
     usage = {}
@@ -157,16 +144,14 @@ def _inspect(run: Run, steps: list[LogStep]) -> dict[str, Any]:
         )
     scores = {"heldout": summary.score, "random": summary.random_score}
     known = {name: value for name, value in scores.items() if value is not None}
+    choices = [] if last is None else [{"message": last, "stop_reason": "stop"}]
     sample = {
         "id": summary.env,
         "epoch": record.repeat + 1,
         "input": next((step.text for step in steps if step.source == "user"), ""),
         "target": "",
         "messages": messages,
-        "output": {
-            "model": model,
-            "choices": [] if last is None else [{"message": last, "stop_reason": "stop"}],
-        },
+        "output": {"model": model, "choices": choices},
         "scores": {name: {"value": value} for name, value in known.items()},
         "metadata": _about(run),
         "model_usage": usage,
@@ -175,15 +160,13 @@ def _inspect(run: Run, steps: list[LogStep]) -> dict[str, Any]:
         "total_time": record.timing.wall_time_seconds,
         "uuid": _id(run),
     }
-    state = _STATES.get(summary.status, "success")
+    state = summary.status if summary.status in ("cancelled", "error") else "success"
     reason = f"run.json: {summary.closed_reason or summary.status}"
     return {
         "version": INSPECT,
         "status": state,
         "eval": {
-            "eval_id": _id(run),
-            "run_id": _id(run),
-            "task_id": _id(run),
+            **dict.fromkeys(("eval_id", "run_id", "task_id"), _id(run)),
             "created": begun,
             "task": f"evopolicy/{summary.env}",
             "task_args": {"budget": summary.budget},
@@ -191,13 +174,9 @@ def _inspect(run: Run, steps: list[LogStep]) -> dict[str, Any]:
             "model": model,
             "config": {},
             "packages": {"evopolicy": record.versions.harness},
-            "metadata": {
-                "entry": summary.entry,
-                "harness": record.agent.harness,
-                "exp_id": record.exp_id,
-            },
+            "metadata": {"entry": summary.entry, "harness": harness, "exp_id": record.exp_id},
         },
-        "plan": {"steps": [{"solver": record.agent.harness, "params": {}}]},
+        "plan": {"steps": [{"solver": harness, "params": {}}]},
         "results": {
             "total_samples": 1,
             "completed_samples": 1,

@@ -255,7 +255,7 @@ async def _clean_up(state: TaskState) -> None:
     live = _live.pop(state.store.get(_KEY, ""), None)
     if live is not None:
         _count(live)
-        await awaited(_cancel(live))
+        await awaited(_cancelled(live.playing))
 
 
 @tool
@@ -418,8 +418,7 @@ async def _begin(cluster: Cluster, plan: Plan) -> _Live:
         served = started.result().served
         await _first(served, playing)
     except asyncio.CancelledError:
-        playing.cancel()
-        await asyncio.wait([playing])
+        await _cancelled(playing)
         raise
     urls = served.result().variables
     client = Client(
@@ -447,6 +446,6 @@ async def _end(live: _Live) -> Run:
     return await live.playing
 
 
-async def _cancel(live: _Live) -> None:
-    live.playing.cancel()
-    await asyncio.wait([live.playing])
+async def _cancelled(playing: asyncio.Task[Run]) -> None:
+    playing.cancel()
+    await asyncio.wait([playing])

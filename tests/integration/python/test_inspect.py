@@ -172,7 +172,7 @@ def test_the_pages_commands_play(inspect: Path, tmp_path: Path) -> None:
     assert json.loads((folder / "run.json").read_text())["outcome"]["budget_used"] == 0
 
 
-def test_what_forbids_every_sample_ends_inspect_with_one_line(inspect: Path, tmp_path: Path) -> None:
+def test_an_error_of_every_sample_ends_inspect_with_one_line(inspect: Path, tmp_path: Path) -> None:
     state = tmp_path / "state"
     state.mkdir(mode=0o700)
     command: list[str | Path] = [

@@ -43,9 +43,12 @@ WRONG_EVALUATIONS: dict[str, list[Any]] = {
 }
 
 
-def each(wrong: dict[str, list[Any]]) -> pytest.MarkDecorator:
-    pairs = [(name, value) for name, values in wrong.items() for value in values]
-    return pytest.mark.parametrize(("name", "value"), pairs, ids=str)
+WRONG = [
+    (call, name, value)
+    for call, arguments in (("run", WRONG_RUNS), ("evaluate", WRONG_EVALUATIONS))
+    for name, values in arguments.items()
+    for value in values
+]
 
 
 @pytest.fixture(autouse=True)
@@ -56,21 +59,14 @@ def _no_cluster(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(evp.Cluster, "_open", opened)
 
 
-@each(WRONG_RUNS)
-def test_a_wrong_argument_of_run_is_named(name: str, value: Any, tmp_path: Path) -> None:
+@pytest.mark.parametrize(("call", "name", "value"), WRONG, ids=str)
+def test_a_wrong_argument_is_named(call: str, name: str, value: Any, tmp_path: Path) -> None:
+    (tmp_path / "policy.py").write_text("class Policy: pass")
+    usual = {"run": {"runs": tmp_path / "runs"} | RUN, "evaluate": {"policy": tmp_path, "env": "toy/line"}}
     with pytest.raises(evp.ConfigError) as error:
-        evp.run(**({"runs": tmp_path / "runs"} | RUN | {name: value}))
+        getattr(evp, call)(**usual[call] | {name: value})
     assert str(error.value).startswith(f"{name} is {value!r}: give ")
     assert not (tmp_path / "runs").exists()
-
-
-@each(WRONG_EVALUATIONS)
-def test_a_wrong_argument_of_evaluate_is_named(name: str, value: Any, tmp_path: Path) -> None:
-    (tmp_path / "policy.py").write_text("class Policy: pass")
-    arguments: dict[str, Any] = {"policy": tmp_path, "env": "toy/line"} | {name: value}
-    with pytest.raises(evp.ConfigError) as error:
-        evp.evaluate(**arguments)
-    assert str(error.value).startswith(f"{name} is {value!r}: give ")
 
 
 @pytest.mark.parametrize(

@@ -61,7 +61,7 @@ def export(*words: str | Path, **environment: str) -> subprocess.CompletedProces
 
 
 def exported(*words: str | Path, **environment: str) -> str:
-    """What the command says on stderr when it succeeds."""
+    """The stderr of the command, which succeeds."""
     done = export(*words, **environment)
     assert done.returncode == 0, done.stderr
     return done.stderr
@@ -132,19 +132,21 @@ def scalars(out: Path) -> dict[str, list[tuple[int, float]]]:
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
     (folder,) = {path.parent for path in out.rglob("events.out.tfevents.*")}
-    found = EventAccumulator(str(folder)).Reload()
-    return {name: [(one.step, one.value) for one in found.Scalars(name)] for name in found.Tags()["scalars"]}
+    events = EventAccumulator(str(folder)).Reload()
+    return {
+        name: [(one.step, one.value) for one in events.Scalars(name)] for name in events.Tags()["scalars"]
+    }
 
 
 def test_tensorboard_reads_returns_over_the_budget_once(runs: Path, tmp_path: Path) -> None:
     for _ in range(2):
         exported(runs, "--to", "tensorboard", "--out", tmp_path / "events")
-    found = scalars(tmp_path / "events")
-    assert found["train/mean_return"] == [(2, 1.5), (4, 4.0)]
-    assert found["submit/ok"] == [(2, 1.0), (4, 1.0), (5, 0.0)]
-    assert found["validation/mean_return"] == [(2, 0.5), (4, 2.5)]
-    assert found["heldout/mean_return"] == [(5, 5.0)]
-    assert found["random/mean_return"] == [(5, -7.0)]
+    curves = scalars(tmp_path / "events")
+    assert curves["train/mean_return"] == [(2, 1.5), (4, 4.0)]
+    assert curves["submit/ok"] == [(2, 1.0), (4, 1.0), (5, 0.0)]
+    assert curves["validation/mean_return"] == [(2, 0.5), (4, 2.5)]
+    assert curves["heldout/mean_return"] == [(5, 5.0)]
+    assert curves["random/mean_return"] == [(5, -7.0)]
 
 
 def test_runs_of_one_name_have_curves_of_their_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

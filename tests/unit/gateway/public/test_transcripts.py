@@ -165,29 +165,29 @@ def test_trajectories_have_the_fields_of_the_published_format(tmp_path: Path, lo
     tokens = Tokens(input_noncached=100, cache_read=50, cache_creation=5, output=7, cost=0.5)
     write_run(tmp_path / "runs", VERSIONS, log=log, tokens=tokens, heldout=(4.0, 6.0))
     (path,) = write_atif(load_runs(tmp_path / "runs"), tmp_path / "out")
-    found = json.loads(path.read_text())
-    check(found)
-    assert found["final_metrics"]["total_prompt_tokens"] == 155
-    assert found["extra"]["evopolicy"]["score"] == 5.0
+    document = json.loads(path.read_text())
+    check(document)
+    assert document["final_metrics"]["total_prompt_tokens"] == 155
+    assert document["extra"]["evopolicy"]["score"] == 5.0
     if log is not None:
-        assert "It was too slow." in "".join(step["message"] for step in found["steps"])
+        assert "It was too slow." in "".join(step["message"] for step in document["steps"])
 
 
-def check(found: dict[str, Any]) -> None:
+def check(document: dict[str, Any]) -> None:
     """The published fields and rules; and Harbor's own models, where these are installed."""
 
     def fields(kind: str, one: dict[str, Any]) -> None:
         required, optional = FIELDS[kind]
         assert required <= one.keys() <= required | optional, (kind, one.keys())
 
-    fields("trajectory", found)
-    assert found["schema_version"] == "ATIF-v1.7"
-    fields("agent", found["agent"])
-    fields("metrics", found["final_metrics"])
-    assert [step["step_id"] for step in found["steps"]] == [*range(1, len(found["steps"]) + 1)]
-    assert found["steps"]
+    fields("trajectory", document)
+    assert document["schema_version"] == "ATIF-v1.7"
+    fields("agent", document["agent"])
+    fields("metrics", document["final_metrics"])
+    assert [step["step_id"] for step in document["steps"]] == [*range(1, len(document["steps"]) + 1)]
+    assert document["steps"]
     known: set[str] = set()
-    for step in found["steps"]:
+    for step in document["steps"]:
         fields("step", step)
         assert isinstance(step["message"], str)
         assert step["source"] == "agent" or (
@@ -206,7 +206,7 @@ def check(found: dict[str, Any]) -> None:
         from harbor.models.trajectories import Trajectory
     except ModuleNotFoundError:
         return
-    Trajectory.model_validate(found)
+    Trajectory.model_validate(document)
 
 
 def test_a_run_whose_times_are_none_is_exported_with_the_others(tmp_path: Path) -> None:
