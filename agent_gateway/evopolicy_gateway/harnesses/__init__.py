@@ -25,10 +25,9 @@ from evopolicy_gateway.harnesses.coding_agents.codex import Codex
 from evopolicy_gateway.harnesses.coding_agents.configured import ConfiguredCli
 from evopolicy_gateway.harnesses.coding_agents.dialect import Dialect
 from evopolicy_gateway.harnesses.coding_agents.llm import Llm
-from evopolicy_gateway.harnesses.command import CommandHarness, ReplayHarness
+from evopolicy_gateway.harnesses.command import CommandHarness, RemoteHarness, ReplayHarness
 from evopolicy_gateway.harnesses.interface.agent_config import AcpTable, AgentConfig, read_agent
 from evopolicy_gateway.harnesses.interface.base import Harness
-from evopolicy_gateway.harnesses.remote import RemoteHarness
 
 FORMS = (
     "evolve, random, replay:DIR, command:PROGRAM…, acp:PROGRAM…, file:AGENT.toml,",
@@ -40,6 +39,7 @@ _MODELS = {"openai": re.compile(r"(chat)?gpt-.+|o\d.*"), "anthropic": re.compile
 """Names of models by their providers."""
 _INTERPRETER = re.compile(r"(python|bash|sh|node|perl|ruby)[\d.]*")
 _SCRIPTS = "py|sh|js|ts|rb|pl"
+_MODULES = {"evolve": "evolve", "random": "uniform"}
 _DIALECTS: dict[str, type[Dialect]] = {"codex": Codex, "claude-code": ClaudeCode, "llm": Llm}
 
 
@@ -77,13 +77,12 @@ def make(agent: str, started_in: Path, config: AgentConfig | None = None) -> Har
 
     Files in a command or after `replay:` are relative to `started_in`, as the agent itself runs elsewhere.
     """
-    kind, colon, rest = agent.partition(":")
+    kind, _, rest = agent.partition(":")
     config = config or config_of(agent, started_in)
     if config is not None:
         return _cli_agent(config, started_in)
-    if kind in ("evolve", "random") and not colon:
-        module = {"evolve": "evolve", "random": "uniform"}[kind]
-        return CommandHarness(kind, _ours(module))
+    if agent in _MODULES:
+        return CommandHarness(agent, _ours(_MODULES[agent]))
     if agent == RemoteHarness.name:
         return RemoteHarness()
     if kind == "replay" and rest:
@@ -93,9 +92,13 @@ def make(agent: str, started_in: Path, config: AgentConfig | None = None) -> Har
         return ReplayHarness([*_ours("replay"), str(folder)], folder)
     if kind == "command" and rest.strip():
         words = _split(rest)
-        return CommandHarness(
-            "command", _program(agent, words, started_in), hint=_no_files(words, started_in)
+        lost = _missing_files(words, started_in)
+        hint = (
+            f"{started_in} has no {', '.join(lost)}: relative paths are looked for there first"
+            if lost
+            else ""
         )
+        return CommandHarness("command", _program(agent, words, started_in), hint=hint)
     meant = _meant(agent, started_in) or _nearest(agent)
     advice = f"--agent {shlex.quote(meant)}, or " if meant else ""
     error = ConfigError(f"--agent {agent!r} is not an agent; write {advice}one of these forms:")
@@ -180,7 +183,6 @@ def _split(command: str) -> list[str]:
 
 
 def _program(agent: str, words: list[str], started_in: Path) -> list[str]:
-    """The command with absolute paths for files that exist in `started_in`."""
     resolved = _absolute(words, started_in)
     if shutil.which(resolved[0]) is None:
         raise ConfigError(
@@ -196,16 +198,10 @@ def _program(agent: str, words: list[str], started_in: Path) -> list[str]:
     return resolved
 
 
-def _no_files(words: Sequence[str], started_in: Path) -> str:
-    """A hint that names words of a command that look like files but do not exist; empty if there are none."""
-    lost = _missing_files(words, started_in)
-    return f"{started_in} has no {', '.join(lost)}: relative paths are looked for there first" if lost else ""
-
-
 def _missing_files(words: Sequence[str], started_in: Path) -> list[str]:
-    """The words that look like files and do not exist."""
-    looks = re.compile(rf"(\./|\.\./)?[\w./-]+\.({_SCRIPTS}|toml|yaml|json)")
-    return [word for word in words if looks.fullmatch(word) and not (started_in / word).exists()]
+    """The words that have the form of a file's name, without such a file."""
+    form = re.compile(rf"(\./|\.\./)?[\w./-]+\.({_SCRIPTS}|toml|yaml|json)")
+    return [word for word in words if form.fullmatch(word) and not (started_in / word).exists()]
 
 
 def _absolute(words: Sequence[str], started_in: Path) -> list[str]:

@@ -10,6 +10,7 @@ program is ended (`clock.Activity`).
 from __future__ import annotations
 
 import asyncio
+import contextlib
 from pathlib import Path
 from typing import Any
 
@@ -20,9 +21,11 @@ from evopolicy_gateway.agents import replay
 from evopolicy_gateway.harnesses.interface.base import Harness, Stage
 from evopolicy_gateway.processes.agent_process import AgentProcess
 from evopolicy_gateway.processes.child_messages import AgentEnded
+from evopolicy_gateway.run_folder.layout import RunFolder
 from evopolicy_gateway.workspace import prompts
 
 _PIPE_TIMEOUT_S = 1.0
+_POLL_S = 0.5
 _STOP_TIMEOUT_S = 10.0
 """Time that a program has to exit after it sent stop, seconds."""
 IDLE_TURNS = 10
@@ -57,9 +60,8 @@ class CommandHarness(Harness):
             if talking.done() and not talk.stopped:
                 await asyncio.wait([ended, silent], return_when=asyncio.FIRST_COMPLETED)
             if silent.done() and not (ended.done() or talk.stopped):
-                return AgentEnded(
-                    reason="silent", detail=silent.result(), turns=talk.turn, facts=self.known()
-                )
+                facts, why = self.known(), silent.result()
+                return AgentEnded(reason="silent", detail=why, turns=talk.turn, facts=facts)
             # The pipe may still hold the last lines; do not wait for a child that keeps it open.
             await asyncio.wait([talking], timeout=_PIPE_TIMEOUT_S)
             await asyncio.wait([ended], timeout=_STOP_TIMEOUT_S if talk.stopped else None)
@@ -100,6 +102,23 @@ class ReplayHarness(CommandHarness):
                 f"--agent replay: {folder} holds no policy; name a folder with policy.py in it, or with folders that"
                 " have one, such as a run's checkpoints"
             )
+
+
+class RemoteHarness(Harness):
+    """`remote`: an agent that someone else starts, in a container or on another host; this harness only waits.
+
+    We control neither the agent nor what it may see and reach. It ends when the budget is spent, when its time is up,
+    or when the operator runs `evopolicy finish RUN_DIRECTORY`.
+    """
+
+    name = "remote"
+    resumable = True
+
+    async def play(self, stage: Stage) -> AgentEnded:
+        finish = RunFolder(stage.workspace.parent).finish
+        while not finish.exists() and not stage.over.is_set():
+            await stage.sleep(_POLL_S)
+        return AgentEnded(reason="agent_stopped", facts={"settings": {"started_by": "the operator"}})
 
 
 class _Talk:
@@ -173,9 +192,6 @@ async def _message(stage: Stage, turn: int) -> str | None:
 
 def _answer(line: bytes) -> dict[str, Any] | None:
     """The line as a turn's answer; None if it is no JSON object."""
-    if not line.lstrip().startswith(b"{"):
-        return None
-    try:
-        return dict(orjson.loads(line))
-    except orjson.JSONDecodeError:
-        return None
+    with contextlib.suppress(orjson.JSONDecodeError):
+        return dict(orjson.loads(line)) if line.lstrip().startswith(b"{") else None
+    return None

@@ -26,7 +26,7 @@ from evopolicy_gateway.relay.usage import Prices
 
 _PR_SET_DUMPABLE = 4
 _TELL_S = 60.0
-"""How often the operator is told what was used."""
+"""Time between notes of the use so far, seconds."""
 
 
 async def tell(
@@ -35,7 +35,7 @@ async def tell(
     say: Callable[[str], None],
     sleep: Callable[[float], Awaitable[None]] = asyncio.sleep,
 ) -> None:
-    """Says what was used so far, once a minute in which there were requests."""
+    """Says how much was used so far, once a minute in which there were requests."""
     told = used.requests
     while True:
         await sleep(_TELL_S)

@@ -8,12 +8,12 @@ text, at
 from __future__ import annotations
 
 import re
+from collections.abc import Iterable, Iterator
 from typing import Any
 
 import msgspec
 import orjson
 
-from evopolicy_gateway.relay.paths import values
 from evopolicy_gateway.relay.usage import Usage
 
 MAX_EVENT_BYTES = 16 << 20
@@ -36,7 +36,7 @@ class Shape(msgspec.Struct, frozen=True, kw_only=True):
     input_includes_cached: bool
     model: tuple[str, ...]
     text: tuple[str, ...]
-    """What the model generated, for an estimate."""
+    """The model's own texts, for an estimate."""
     last: frozenset[str]
     """`type` of the events after which no count follows."""
 
@@ -89,16 +89,6 @@ SHAPES: dict[str, Shape] = {
 """By the last part of the API's path."""
 
 
-class Metered(msgspec.Struct, frozen=True, kw_only=True):
-    """The tokens of one answer."""
-
-    usage: Usage
-    estimated: bool
-    """Whether a count is an estimate."""
-    model: str
-    """The model that answered; empty when the answer does not name it."""
-
-
 class AnswerReader:
     """Reads one answer as it comes."""
 
@@ -140,7 +130,7 @@ class AnswerReader:
         return b"".join(out)
 
     def end(self) -> bytes:
-        """Reads what is left at the answer's end, and returns it."""
+        """Reads the rest at the answer's end, and returns it."""
         rest = bytes(self._held)
         self._held.clear()
         if not self._events:
@@ -150,10 +140,11 @@ class AnswerReader:
             self._read_event(rest)
         return rest
 
-    def metered(self, request_bytes: int) -> Metered:
-        """The counts so far. `request_bytes`: of the request, for an estimate of the input."""
+    def metered(self, request_bytes: int) -> dict[str, Any]:
+        """The counts so far, as fields of a `limits.Request`. `request_bytes`: of the request, for an estimate of the
+        input."""
         tokens, guessed = dict(self._counts), set(self._wrong)
-        told = self.complete or (self._shape.last == frozenset() and "output" in tokens)
+        told = self.complete or not self._shape.last
         if "input" not in tokens:
             tokens["input"] = request_bytes // CHARS_PER_TOKEN
             guessed.add("input")
@@ -173,7 +164,7 @@ class AnswerReader:
             output=tokens["output"],
             reasoning=None if reasoning is None else min(reasoning, tokens["output"]),
         )
-        return Metered(usage=usage, estimated=bool(guessed), model=self._model)
+        return {"usage": usage, "estimated": bool(guessed), "answered": self._model}
 
     def _read_event(self, event: bytes) -> bool:
         """Returns whether the event has counts alone."""
@@ -212,6 +203,31 @@ class AnswerReader:
         return True
 
 
+def values(document: Any, path: str) -> Iterator[Any]:
+    """Yields every value at a dotted path; nothing for an empty path. `*` stands for each element of a list, and
+    `[name=value]` for an object with that value."""
+    if not path:
+        return
+    if path.startswith("["):
+        condition, _, rest = path[1:].partition("]")
+        name, _, wanted = condition.partition("=")
+        if isinstance(document, dict) and document.get(name) == wanted:
+            yield from values(document, rest.removeprefix("."))
+        return
+    head, _, rest = path.partition(".")
+    if head == "*":
+        inner: Iterable[Any] = document if isinstance(document, list) else ()
+    elif isinstance(document, dict) and head in document:
+        inner = (document[head],)
+    else:
+        return
+    for value in inner:
+        if rest:
+            yield from values(value, rest)
+        else:
+            yield value
+
+
 def _decoded(data: bytes) -> Any:
     try:
         return orjson.loads(data)
@@ -237,6 +253,6 @@ class Cleaner:
         return data[: len(data) - held]
 
     def end(self) -> bytes:
-        """What is held at the end of the stream."""
+        """The bytes that are held back at the end of the stream."""
         rest, self._held = self._held, b""
         return rest

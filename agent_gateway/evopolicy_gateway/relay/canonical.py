@@ -27,7 +27,7 @@ LEFT_OUT: dict[str, tuple[str, ...]] = {
 """Dotted paths of fields that are left out; `*` stands for each element of a list."""
 _CLOCK = rb"\d\d:\d\d(?::\d\d(?:\.\d+)?)?"
 _ID = rb"-[0-9a-f]{4}-[0-9a-f]{4}-[0-9a-f]{4}-[0-9a-f]{12}"
-# Each begins with few bytes, by which `re` finds its places fast: every request of a run is looked through.
+# Each begins with few bytes, by which `re` finds its places fast: it searches every request of a run.
 TEXTS: tuple[tuple[str, re.Pattern[bytes], bytes], ...] = (
     (
         "dates and times of ISO 8601",

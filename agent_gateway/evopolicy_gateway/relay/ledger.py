@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from pathlib import Path
 
 import msgspec
@@ -32,15 +33,10 @@ class Ledger:
 
 
 def read(path: Path, declared: str | None = None) -> Used:
-    """What a ledger's requests used; nothing where there is no ledger. Lines that cannot be read are skipped."""
+    """The use of a ledger's requests; none where there is no ledger. Lines that cannot be read are skipped."""
     used = Used()
-    try:
-        lines = path.read_bytes().splitlines()
-    except OSError:
-        return used
-    for line in lines:
-        try:
-            used.take(_decoder.decode(line), declared)
-        except DECODE_ERRORS:
-            continue
+    with contextlib.suppress(OSError):
+        for line in path.read_bytes().splitlines():
+            with contextlib.suppress(*DECODE_ERRORS):
+                used.take(_decoder.decode(line), declared)
     return used

@@ -1,4 +1,4 @@
-"""What a run's agent may use of its model, and what it has used so far. No I/O."""
+"""Limits of a run's use of its model, and its use so far. No I/O."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from typing import Annotated, Any
 import msgspec
 from msgspec import Meta
 
+from evopolicy_gateway.relay.apis import Upstream
 from evopolicy_gateway.relay.usage import Prices, Usage
 
 _MAX_NAMES = 20
@@ -24,6 +25,21 @@ class Limits(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     def __str__(self) -> str:
         dollars = "" if self.max_cost is None else f", {self.max_cost:,.2f} dollars"
         return f"{self.max_requests:,} requests, {self.max_tokens:,} tokens{dollars}"
+
+
+class ModelTerms(msgspec.Struct, frozen=True, kw_only=True):
+    """The terms on which an agent may use its model."""
+
+    upstream: Upstream | None
+    """The API behind the relay; None: the agent cannot use the relay."""
+    limits: Limits = Limits()
+    prices: Prices | None = None
+    model: str | None = None
+    """The declared model."""
+    declared_only: bool = False
+    """Whether requests for other models are refused."""
+    own_tools_only: bool = False
+    """Whether requests with tools that the provider runs are refused."""
 
 
 class Request(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):

@@ -10,6 +10,7 @@ from __future__ import annotations
 import base64
 import contextlib
 from collections.abc import AsyncIterator, Mapping
+from typing import NamedTuple
 from urllib.parse import unquote, urlsplit
 from urllib.request import getproxies, proxy_bypass
 
@@ -23,25 +24,20 @@ FAILED = (
     httpcore.TimeoutException,
     httpcore.UnsupportedProtocol,
 )
-"""What a request or its answer may raise."""
+"""Errors of a request or its answer."""
 _CONNECT_S = 30.0
 _KEEP_ALIVE_S = 60.0
 _HERE = ("localhost", "127.0.0.1")
 
 
-class Answer:
-    """The provider's answer, whose body is still to come."""
+class Answer(NamedTuple):
+    """An answer whose body is still to come."""
 
-    def __init__(self, response: httpcore.Response) -> None:
-        self.status = response.status
-        self.headers = {
-            name.decode("latin-1").lower(): value.decode("latin-1") for name, value in response.headers
-        }
-        self._response = response
-
-    def pieces(self) -> AsyncIterator[bytes]:
-        """The body, as it comes. Raises `FAILED`."""
-        return self._response.aiter_stream()
+    status: int
+    headers: Mapping[str, str]
+    """By names in lower case."""
+    pieces: AsyncIterator[bytes]
+    """The body, as it comes. Raises `FAILED`."""
 
 
 class Provider:
@@ -83,7 +79,9 @@ class Provider:
         async with self._pool.stream(
             method, url, headers=wanted, content=body, extensions=self._extensions
         ) as response:
-            yield Answer(response)
+            names = [(name.decode("latin-1").lower(), value) for name, value in response.headers]
+            headers = {name: value.decode("latin-1") for name, value in names}
+            yield Answer(response.status, headers, response.aiter_stream())
 
 
 def _encoded(value: str) -> bytes:

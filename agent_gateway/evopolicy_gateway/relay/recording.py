@@ -6,6 +6,7 @@ The run has precedence: at a limit, or when the disk refuses, recording stops wi
 from __future__ import annotations
 
 import contextlib
+import itertools
 from collections.abc import AsyncIterator, Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, Protocol
@@ -19,19 +20,11 @@ from evopolicy_common.records.model_record import Call, Kept, Level, Pack, key_o
 from evopolicy_common.records.secrets import Redaction
 from evopolicy_gateway.relay import apis
 from evopolicy_gateway.relay.canonical import canonical
+from evopolicy_gateway.relay.provider import Answer
 
 _MAX_ANSWER_BYTES = 8 << 20
 """Limit of an answer whose content is kept."""
 _MAX_HEADERS, _MAX_HEADER = 30, 200
-
-
-class Answer(Protocol):
-    """A provider's answer, whose body is still to come."""
-
-    status: int
-    headers: dict[str, str]
-
-    def pieces(self) -> AsyncIterator[bytes]: ...
 
 
 class Source(Protocol):
@@ -39,7 +32,7 @@ class Source(Protocol):
 
     def sent(
         self, method: str, url: str, headers: Mapping[str, str], body: bytes
-    ) -> contextlib.AbstractAsyncContextManager[Any]: ...
+    ) -> contextlib.AbstractAsyncContextManager[Answer]: ...
 
     async def close(self) -> None: ...
 
@@ -84,8 +77,8 @@ class Recorder:
         self._n = self._begun = 0
         self._pack: Pack | None = None
         self._opened = contextlib.ExitStack()
-        with self._stopping():
-            if self._on:
+        if self._on:
+            with self._stopping():
                 self._open(folder, level)
 
     async def close(self) -> None:
@@ -112,7 +105,7 @@ class Recorder:
         try:
             async with self._source.sent(method, url, headers, body) as got:
                 answer = _Heard(got)
-                yield answer
+                yield got._replace(pieces=answer.pieces())
         finally:
             if self._on:
                 with self._stopping():
@@ -120,7 +113,7 @@ class Recorder:
 
     @contextlib.contextmanager
     def _stopping(self) -> Iterator[None]:
-        """What fails within ends the record, and not the run."""
+        """An error inside the `with` ends the record, and not the run."""
         try:
             yield
         except (OSError, ValueError, ConfigError) as error:
@@ -135,22 +128,22 @@ class Recorder:
         if self._n >= model_record.MAX_CALLS:
             raise ValueError(f"its limit of {model_record.MAX_CALLS:,} calls is reached")
         request = canonical(api, self._clean(body))
-        call: dict[str, Any] = {"n": n, "api": api, "method": method, "digest": key_of(request)}
-        call |= {"status": 0, "broken": True}
+        call: dict[str, Any] = {"status": 0, "broken": True}
         if answer is not None:
             data = self._clean(bytes(answer.heard))
-            passed = list(apis.passed_down(answer.headers).items())[:_MAX_HEADERS]
-            headers = {
-                name: self._clean(value.encode()).decode("utf-8", "replace")[:_MAX_HEADER]
-                for name, value in passed
-            }
-            call |= {"status": answer.status, "headers": headers, "broken": not answer.ended}
+            passed = itertools.islice(apis.passed_down(answer.got.headers).items(), _MAX_HEADERS)
+            cleaned = (
+                (name, self._clean(value.encode()).decode("utf-8", "replace")) for name, value in passed
+            )
+            headers = {name: value[:_MAX_HEADER] for name, value in cleaned}
+            call |= {"status": answer.got.status, "headers": headers, "broken": not answer.ended}
             call |= {"answer": "" if answer.left_out else key_of(data), "left_out": answer.left_out}
             if self._pack is not None and not answer.left_out:
                 self._pack.put(data)
         if self._pack is not None:
             call["request"] = _put_request(self._pack, request)
-        self._calls.write(msgspec.json.encode(Call(**call)) + b"\n")
+        line = Call(n=n, api=api, method=method, digest=key_of(request), **call)
+        self._calls.write(msgspec.json.encode(line) + b"\n")
         self._n += 1
 
 
@@ -158,15 +151,14 @@ class _Heard:
     """An answer whose bytes are kept as they pass."""
 
     def __init__(self, got: Answer) -> None:
-        self._got = got
-        self.status, self.headers = got.status, got.headers
+        self.got = got
         self.heard = bytearray()
         self.ended = False
         coding = got.headers.get("content-encoding", "identity").strip().lower()
         self.left_out = "" if coding == "identity" else f"it came compressed as {coding[:20]}"
 
     async def pieces(self) -> AsyncIterator[bytes]:
-        async for data in self._got.pieces():
+        async for data in self.got.pieces:
             if len(self.heard) + len(data) > _MAX_ANSWER_BYTES:
                 self.left_out = "it is too long"
                 self.heard.clear()
@@ -191,9 +183,10 @@ def document_of(request: bytes) -> dict[str, Any]:
 
 
 def _put_request(pack: Pack, request: bytes) -> str:
-    """Keeps a request as `Kept`."""
-    document = document_of(request)
-    lists = {name: value for name, value in document.items() if isinstance(value, list)}
-    plain = {name: value for name, value in document.items() if name not in lists}
-    lists = {name: [pack.put(orjson.dumps(each)) for each in value] for name, value in lists.items()}
-    return pack.put(msgspec.json.encode(Kept(plain=plain, lists=lists)))
+    kept = Kept(plain={}, lists={})
+    for name, value in document_of(request).items():
+        if isinstance(value, list):
+            kept.lists[name] = [pack.put(orjson.dumps(each)) for each in value]
+        else:
+            kept.plain[name] = value
+    return pack.put(msgspec.json.encode(kept))

@@ -15,7 +15,8 @@ import httpcore
 
 from evopolicy_common.records.model_record import Pack, key_of, read_calls, request_of
 from evopolicy_gateway.relay.canonical import canonical, difference
-from evopolicy_gateway.relay.recording import Answer, Cleaning, api_of, document_of
+from evopolicy_gateway.relay.provider import Answer
+from evopolicy_gateway.relay.recording import Cleaning, api_of, document_of
 
 DIFFERENCE = "difference.txt"
 _PIECE = 64 << 10
@@ -44,23 +45,19 @@ class Replayed:
         digest = key_of(request)
         call = next((each for each in self._left if each.digest == digest and each.api == api), None)
         if call is None or call.left_out:
-            why = (
-                self._unmatched(api, request)
-                if call is None
-                else f"answer {call.n} was not kept: {call.left_out}"
-            )
+            why = f"answer {call.n} was not kept: {call.left_out}" if call else self._unmatched(api, request)
             if not (path := self._out / DIFFERENCE).exists():
                 path.write_text(why + "\n")
             self._differs(why.partition("\n")[0])
             refusal = {"error": {"message": "the replay has ended", "type": "invalid_request_error"}}
             ended = {"content-type": "application/json", "x-should-retry": "false"}
-            yield _Given(400, ended, json.dumps(refusal).encode(), broken=False)
+            yield Answer(400, ended, _pieces(json.dumps(refusal).encode()))
             return
         self._left.remove(call)
         if not call.status:
             raise httpcore.NetworkError("no answer came when this was recorded")
         data = self._clean.restored(self._pack.get(call.answer))
-        yield _Given(call.status, call.headers, data, broken=call.broken)
+        yield Answer(call.status, call.headers, _pieces(data, broken=call.broken))
 
     def _unmatched(self, api: str, request: bytes) -> str:
         expected = next((call for call in self._left if call.api == api), None)
@@ -70,15 +67,8 @@ class Replayed:
         return f"request {expected.n} to {api} differs:\n{difference(recorded, document_of(request))}"
 
 
-class _Given:
-    """A recorded answer."""
-
-    def __init__(self, status: int, headers: dict[str, str], data: bytes, *, broken: bool) -> None:
-        self.status, self.headers = status, headers
-        self._data, self._broken = data, broken
-
-    async def pieces(self) -> AsyncIterator[bytes]:
-        for at in range(0, len(self._data), _PIECE):
-            yield self._data[at : at + _PIECE]
-        if self._broken:
-            raise httpcore.ReadError("the answer broke off when this was recorded")
+async def _pieces(data: bytes, *, broken: bool = False) -> AsyncIterator[bytes]:
+    for at in range(0, len(data), _PIECE):
+        yield data[at : at + _PIECE]
+    if broken:
+        raise httpcore.ReadError("the answer broke off when this was recorded")

@@ -24,11 +24,9 @@ from evopolicy_gateway.relay import apis, limits
 from evopolicy_gateway.relay.answers import SHAPES, AnswerReader, Cleaner
 from evopolicy_gateway.relay.apis import Refusal, Upstream
 from evopolicy_gateway.relay.ledger import Ledger
-from evopolicy_gateway.relay.limits import Limits
-from evopolicy_gateway.relay.provider import FAILED, Provider
-from evopolicy_gateway.relay.recording import Answer, Cleaning, Recorder, Source
+from evopolicy_gateway.relay.provider import FAILED, Answer, Provider
+from evopolicy_gateway.relay.recording import Cleaning, Recorder, Source
 from evopolicy_gateway.relay.replaying import Replayed
-from evopolicy_gateway.relay.usage import Prices
 
 MAX_REQUEST_BYTES = 32 << 20
 MAX_ERROR_BYTES = 1 << 20
@@ -45,21 +43,13 @@ _SHOWN = 200
 _MAX_TOOLS = 20
 
 
-class Order(msgspec.Struct, frozen=True, kw_only=True):
-    """What a relay process is started with: one JSON line on its stdin."""
+class Order(limits.ModelTerms, frozen=True, kw_only=True):
+    """The first line on a relay process's stdin, JSON."""
 
     upstream: Upstream
     token: str
     """The agent's, which only this relay accepts."""
     ledger: str
-    limits: Limits = Limits()
-    prices: Prices | None = None
-    model: str | None = None
-    """The declared model."""
-    declared_only: bool = False
-    """Whether requests for other models are refused."""
-    own_tools_only: bool = False
-    """Whether requests with tools that the provider runs are refused."""
     timeout_s: float = 600.0
     """Longest time without a byte from the provider."""
     record: Level = "off"
@@ -70,7 +60,7 @@ class Order(msgspec.Struct, frozen=True, kw_only=True):
     tokens: tuple[str, ...] = ()
     """The run's own, which have other texts in the record."""
     secrets: tuple[str, ...] = ()
-    """What else the record leaves out."""
+    """Other texts that the record leaves out."""
 
 
 class Relay:
@@ -124,9 +114,8 @@ class Relay:
 
     async def _answer(self, request: Request) -> Response:
         if not self._is_agents(request.headers):
-            return self.refused(
-                apis.NO_TOKEN, "the relay does not know this key; use the one of your environment"
-            )
+            why = "the relay does not know this key; use the one of your environment"
+            return self.refused(apis.NO_TOKEN, why)
         if "transfer-encoding" in request.headers and "content-length" in request.headers:
             return self.refused(apis.INVALID, "the request has two lengths", more={"connection": "close"})
         protocol = self.upstream.protocol
@@ -175,9 +164,8 @@ class Relay:
         asked = str(document.get("model", ""))[:_SHOWN]
         if order.model and asked != order.model:
             if order.declared_only:
-                return self.refused(
-                    apis.OTHER_MODEL, f"the run's model is {order.model}; {asked!r} is not allowed"
-                )
+                why = f"the run's model is {order.model}; {asked!r} is not allowed"
+                return self.refused(apis.OTHER_MODEL, why)
             self._once(f"the agent asks for the model {asked!r} besides {order.model}")
         if hosted := tuple(kind[:_SHOWN] for kind in apis.hosted_tools(document)[:_MAX_TOOLS]):
             if order.own_tools_only:
@@ -185,9 +173,8 @@ class Relay:
             self._once(f"the agent offers its model tools of the provider: {', '.join(hosted)}")
         if what := used.over(order.limits, order.prices, self.in_flight):
             if not used.over(order.limits, order.prices):
-                return self.refused(
-                    apis.TOO_MANY, "the last requests of the model budget are under way", retry_after="1"
-                )
+                why = "the last requests of the model budget are under way"
+                return self.refused(apis.TOO_MANY, why, retry_after="1")
             self._spent(what)
             return self.refused(apis.SPENT, f"the run's model budget is spent: {what}")
         if self.in_flight >= MAX_IN_FLIGHT:
@@ -195,14 +182,13 @@ class Relay:
         if order.declared_only or order.own_tools_only:
             # A name that occurs twice is read in one way here, and perhaps in another there.
             body = orjson.dumps(document)
-        drops_usage = False
         options = document.get("stream_options")
-        if api == "chat/completions" and document.get("stream") is True:
-            options = options if isinstance(options, dict) else {}
-            if options.get("include_usage") is not True:
-                drops_usage = True
-                body = orjson.dumps(document | {"stream_options": options | {"include_usage": True}})
-        exchange = _Exchange(self, api, asked, hosted, body, drops_usage=drops_usage)
+        options = options if isinstance(options, dict) else {}
+        streams = api == "chat/completions" and document.get("stream") is True
+        if drops_usage := streams and options.get("include_usage") is not True:
+            body = orjson.dumps(document | {"stream_options": options | {"include_usage": True}})
+        line = limits.Request(at=round(self.now(), 3), api=api, asked=asked, hosted_tools=hosted, status=0)
+        exchange = _Exchange(self, line, body, drops_usage=drops_usage)
         response = None
         try:
             response = await exchange.answer(request, path)
@@ -246,15 +232,12 @@ class Relay:
 
     def clean(self, data: bytes) -> bytes:
         """The bytes without the key, which some servers repeat in their errors."""
-        for secret in self.secrets:
-            data = data.replace(secret, b"[key]")
-        return data
+        cleaner = Cleaner(self.secrets)
+        return cleaner.feed(data) + cleaner.end()
 
     def unreachable(self, error: Exception) -> str:
-        why = str(error) or type(error).__name__
-        return self.clean(f"base_url {self.upstream.shown} gives no answer: {why}".encode()).decode(
-            "utf-8", "replace"
-        )
+        text = f"base_url {self.upstream.shown} gives no answer: {str(error) or type(error).__name__}"
+        return self.clean(text.encode()).decode("utf-8", "replace")
 
     def _once(self, text: str) -> None:
         if text not in self._told and len(self._told) < 20:
@@ -275,13 +258,11 @@ class Relay:
 class _Exchange:
     """One request that costs tokens, and its answer. Call `close` at the end of both."""
 
-    def __init__(
-        self, relay: Relay, api: str, asked: str, hosted: tuple[str, ...], body: bytes, *, drops_usage: bool
-    ) -> None:
-        self._relay = relay
-        self._api, self._asked, self._hosted = api, asked, hosted
+    def __init__(self, relay: Relay, line: limits.Request, body: bytes, *, drops_usage: bool) -> None:
+        """`line`: of the ledger, as far as it is known now."""
+        self._relay, self._line = relay, line
         self._body, self._drops_usage = body, drops_usage
-        self._at, self._begun = relay.now(), time.monotonic()
+        self._begun = time.monotonic()
         self._first_s: float | None = None
         self._written = False
         self._status = 0
@@ -303,7 +284,7 @@ class _Exchange:
         events = kind == "text/event-stream"
         if 200 <= got.status < 300 and (events or kind.endswith("json")):
             relay.troubles = 0
-            self._reader = AnswerReader(SHAPES[self._api], events=events, drops_usage=self._drops_usage)
+            self._reader = AnswerReader(SHAPES[self._line.api], events=events, drops_usage=self._drops_usage)
             return _Streamed(self, self._passed(got, self._reader), got.status, relay.headers_of(got))
         try:
             data = await _whole(_unpacked(got), "answer", MAX_ERROR_BYTES)
@@ -320,9 +301,8 @@ class _Exchange:
         """The answer for one that is no success of this API."""
         relay, status = self._relay, got.status
         shown = relay.clean(data[:_SHOWN]).decode("utf-8", "replace").strip()
-        came = (
-            f"base_url {relay.upstream.shown} answered {status} with {kind or 'no content type'}: {shown!r}"
-        )
+        base, kind_shown = relay.upstream.shown, kind or "no content type"
+        came = f"base_url {base} answered {status} with {kind_shown}: {shown!r}"
         if status < 400:
             self._write(broken=True)
             return relay.refused(apis.INVALID, f"{came}; the base URL of a model API answers with JSON")
@@ -359,20 +339,10 @@ class _Exchange:
             return
         self._written = True
         if self._reader is not None:
-            read = self._reader.metered(len(self._body))
-            more |= {"usage": read.usage, "estimated": read.estimated, "answered": read.model}
-        self._relay.count(
-            limits.Request(
-                at=round(self._at, 3),
-                api=self._api,
-                asked=self._asked,
-                hosted_tools=self._hosted,
-                status=self._status,
-                first_s=None if self._first_s is None else round(self._first_s, 4),
-                whole_s=round(time.monotonic() - self._begun, 4),
-                **more,
-            )
-        )
+            more |= self._reader.metered(len(self._body))
+        more["first_s"] = None if self._first_s is None else round(self._first_s, 4)
+        more["whole_s"] = round(time.monotonic() - self._begun, 4)
+        self._relay.count(msgspec.structs.replace(self._line, status=self._status, **more))
 
 
 class _Streamed(StreamingResponse):
@@ -431,12 +401,11 @@ async def _unpacked(answer: Answer) -> AsyncIterator[bytes]:
     ValueError."""
     coding = answer.headers.get("content-encoding", "identity").strip().lower()
     if coding not in ("identity", "gzip", "x-gzip", "deflate"):
-        raise ValueError(
-            f"the answer is compressed as {coding[:_SHOWN]}, though no compression was asked for"
-        )
+        why = f"the answer is compressed as {coding[:_SHOWN]}, though no compression was asked for"
+        raise ValueError(why)
     unpack = None if coding == "identity" else zlib.decompressobj(wbits=zlib.MAX_WBITS | 32)
     n_bytes = 0
-    async for data in answer.pieces():
+    async for data in answer.pieces:
         rest = data
         while rest:
             if unpack is None:

@@ -105,14 +105,9 @@ def of_run(run: OpenRun, ready: Ready, model_spent: asyncio.Event) -> ModelRelay
         model_spent.set()
 
     order = Order(
-        upstream=terms.upstream,
+        **msgspec.structs.asdict(terms),
         token=token,
         ledger=str(folder.model_requests),
-        limits=terms.limits,
-        prices=terms.prices,
-        model=terms.model,
-        declared_only=terms.declared_only,
-        own_tools_only=terms.own_tools_only,
         record=plan.record_model,
         replay="" if replays is None else str(replays.folder),
         folder=str(folder.model_record),

@@ -58,9 +58,8 @@ class AcpAgent(CliAgent):
     def __init__(self, dialect: Acp) -> None:
         super().__init__(dialect)
         if importlib.util.find_spec("acp") is None:
-            raise ConfigError(
-                f"agents that speak the Agent Client Protocol need its library: {add_extra('acp')}"
-            )
+            why = "agents that speak the Agent Client Protocol need its library"
+            raise ConfigError(f"{why}: {add_extra('acp')}")
         self._acp = dialect
         self._link: _Link | None = None
 
@@ -71,8 +70,7 @@ class AcpAgent(CliAgent):
             await self._hang_up(stage)
 
     async def _probe(self, stage: Stage) -> None:
-        if (missing := self._missing(stage.environment)) is not None:
-            raise AgentError(missing)
+        self._check_program(stage.environment, AgentError)
 
     async def _play_turn(
         self, stage: Stage, session: str | None, prompt: str, reader: TurnReader, capped: Capped
@@ -117,12 +115,8 @@ class AcpAgent(CliAgent):
             if self._acp.table.auth:
                 await link.request("authenticate", {"methodId": self._acp.table.auth})
         servers = [
-            {
-                "name": name,
-                "command": server.command,
-                "args": list(server.args),
-                "env": [{"name": variable, "value": value} for variable, value in server.env.items()],
-            }
+            {"name": name, "command": server.command, "args": list(server.args)}
+            | {"env": [{"name": variable, "value": value} for variable, value in server.env.items()]}
             for name, server in self._acp.kept.servers.items()
         ]
         known = {"cwd": str(stage.workspace), "mcpServers": servers}
@@ -179,10 +173,8 @@ class AcpAgent(CliAgent):
     ) -> None:
         """Sends the prompt and reads updates until its answer."""
         link.listens = True
-        content = [{"type": "text", "text": prompt}]
-        prompt_reply = asyncio.ensure_future(
-            link.request("session_prompt", {"sessionId": link.session, "prompt": content})
-        )
+        sent = {"sessionId": link.session, "prompt": [{"type": "text", "text": prompt}]}
+        prompt_reply = asyncio.ensure_future(link.request("session_prompt", sent))
         try:
             while not prompt_reply.done():
                 update = asyncio.ensure_future(link.updates.get())
@@ -255,14 +247,8 @@ class _Link:
         from acp.meta import PROTOCOL_VERSION
 
         nothing = {"fs": {"readTextFile": False, "writeTextFile": False}, "terminal": False}
-        answer = await self.request(
-            "initialize",
-            {
-                "protocolVersion": PROTOCOL_VERSION,
-                "clientCapabilities": nothing,
-                "clientInfo": {"name": "evopolicy", "version": "1"},
-            },
-        )
+        known = {"clientCapabilities": nothing, "clientInfo": {"name": "evopolicy", "version": "1"}}
+        answer = await self.request("initialize", {"protocolVersion": PROTOCOL_VERSION, **known})
         if (version := answer.get("protocolVersion")) != PROTOCOL_VERSION:
             raise AgentError(
                 f"the agent speaks version {version!r} of the protocol, and evopolicy speaks {PROTOCOL_VERSION}"
@@ -297,7 +283,6 @@ class _Link:
         await self.process.close()
 
     async def _handle(self, method: str, params: Any, is_notification: bool) -> Any:
-        """A request or notification of the agent."""
         from acp.exceptions import RequestError
         from acp.meta import CLIENT_METHODS
 
@@ -309,10 +294,9 @@ class _Link:
         if method == CLIENT_METHODS["session_request_permission"]:
             answer = permission(fields, PurePosixPath(self._stage.workspace))
             call = mapping(fields.get("toolCall"))
-            self._stage.log.note(
-                {"type": "permission", "title": string(call.get("title")), **answer["outcome"]}
-            )
-            # Some agents tell what they do only here.
+            noted = {"type": "permission", "title": string(call.get("title")), **answer["outcome"]}
+            self._stage.log.note(noted)
+            # Some agents tell of a tool call only here.
             self._update({**call, "sessionUpdate": "tool_call_update", "status": "pending"})
             return answer
         if is_notification:
@@ -359,10 +343,9 @@ def _refusal(error: Exception) -> TurnFailure | None:
 
     if not isinstance(error, RequestError):
         return None
-    try:
+    details = ""
+    with contextlib.suppress(TypeError):  # nested too deeply
         details = "" if error.data is None else f" {orjson.dumps(error.data).decode()}"
-    except TypeError:  # nested too deeply
-        details = ""
     if error.code == _AUTH_REQUIRED:
         return TurnFailure(kind="final", message=f"not logged in: {error}{details}", provider=True)
     return turn_failure_of(f"{error}{details}")

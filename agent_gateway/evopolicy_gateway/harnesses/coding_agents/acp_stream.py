@@ -1,4 +1,4 @@
-"""The Agent Client Protocol's messages as a turn's stream: what an agent says, does and asks for. No I/O.
+"""The Agent Client Protocol's messages as a turn's stream: an agent's texts, tool calls and requests. No I/O.
 
 Chunks of text are put together; the log then gets whole messages in the form of Claude Code's `stream-json`, which the
 live page and the reports read. Its raw messages are in the log too.
@@ -38,7 +38,7 @@ _MAX_CALLS = 64
 _MAX_INPUT_BYTES = 256 << 10
 """Of a tool call that is remembered, as JSON."""
 _SHOWN_CHUNKS = 64
-"""Chunks of a text in which its first line is looked for."""
+"""Chunks of a text that may hold its first line."""
 _SKILLS = {"claude-agent-acp": "~/.claude/skills", "qwen": "~/.qwen/skills"}
 """Skill folders of programs that do not read `~/.agents/skills`, by program name."""
 
@@ -52,9 +52,8 @@ class Acp(Dialect):
         self.program = config.program
         self.table = config.acp or AcpTable()
         self.cumulative = self.table.counts == "session"
-        self.skills_at = _SKILLS.get(
-            os.path.basename(self.program[0]) if self.program else "", self.skills_at
-        )
+        name = os.path.basename(self.program[0]) if self.program else ""
+        self.skills_at = _SKILLS.get(name, self.skills_at)
 
     def arguments(self, session: str | None, *, resume: bool, prompt: str, options: str) -> list[str]:
         return list(self.config.extra_args)
@@ -161,11 +160,8 @@ def offered_choice(answer: Mapping[str, Any], category: str) -> Choice | None:
     """The setting of a category, such as `model`, in the answer that begins a session."""
     for option in mappings(answer.get("configOptions")):
         if category in (option.get("category"), option.get("id")):
-            listed = [
-                inner
-                for one in mappings(option.get("options"))
-                for inner in mappings(one.get("options")) or [one]
-            ]
+            groups = mappings(option.get("options"))
+            listed = [one for group in groups for one in mappings(group.get("options")) or [group]]
             values = {string(one.get("name")): string(one.get("value")) for one in listed}
             values |= {value: value for value in values.values()}
             return Choice(string(option.get("id")), string(option.get("currentValue")), values)
@@ -214,9 +210,8 @@ def permission(request: Mapping[str, Any], workspace: PurePosixPath) -> dict[str
     paths = [string(place.get("path")) for place in mappings(call.get("locations"))]
     whole = [PurePosixPath(os.path.normpath(workspace / path)) for path in paths]
     protected = (workspace / "feedback", workspace / "AGENTS.md")
-    forbidden = call.get("kind") in _CHANGES and any(
-        path.is_relative_to(each) for path in whole for each in protected
-    )
+    touched = any(path.is_relative_to(each) for path in whole for each in protected)
+    forbidden = touched and call.get("kind") in _CHANGES
     for kind in ("reject_once", "reject_always") if forbidden else ("allow_once", "allow_always"):
         for option in mappings(request.get("options")):
             if option.get("kind") == kind and isinstance(option.get("optionId"), str):

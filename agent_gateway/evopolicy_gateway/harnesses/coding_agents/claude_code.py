@@ -25,12 +25,20 @@ from evopolicy_gateway.harnesses.coding_agents.dialect import (
     mapping,
     mappings,
     string,
+    usage_of,
 )
 from evopolicy_gateway.harnesses.coding_agents.turn_failure import turn_failure_of
+from evopolicy_gateway.harnesses.interface.agent_config import TokenPaths
 from evopolicy_gateway.inputs.kept import MCP_FILE
-from evopolicy_gateway.relay.usage import Usage, count
+from evopolicy_gateway.relay.usage import Usage
 
 TOOLS = "Bash,Read,Edit,Write,Glob,Grep"
+_TOKENS = TokenPaths(
+    input="usage.input_tokens",
+    cache_read="usage.cache_read_input_tokens",
+    cache_creation="usage.cache_creation_input_tokens",
+    output="usage.output_tokens",
+)
 _MAX_OPEN_MESSAGES = 1000
 _ISOLATION = (("--safe-mode",), ("--strict-mcp-config",))
 _WITH_INPUTS = (("--setting-sources", "user"), ("--strict-mcp-config",))
@@ -39,8 +47,6 @@ bound."""
 
 
 class ClaudeCode(Dialect):
-    """The dialect of `claude`."""
-
     name = "claude-code"
     program = ("claude",)
     tested_version = "2.1.330"
@@ -83,8 +89,6 @@ class ClaudeCode(Dialect):
 
 
 class ClaudeReader(TurnReader):
-    """Reads the stream of one `claude --print`."""
-
     def __init__(self) -> None:
         super().__init__()
         self._messages: dict[str, Usage] = {}
@@ -103,7 +107,7 @@ class ClaudeReader(TurnReader):
     def _message(self, message: Mapping[str, Any]) -> None:
         identity = string(message.get("id"))
         if identity:
-            usage = usage_of(mapping(message.get("usage")))
+            usage = usage_of(message, _TOKENS) or Usage()
             self.usage = self.usage - self._messages.pop(identity, Usage()) + usage
             self._messages[identity] = usage
             if len(self._messages) > _MAX_OPEN_MESSAGES:
@@ -123,7 +127,7 @@ class ClaudeReader(TurnReader):
             self.action = f"$ {first_line(command)}" if command else f"{string(block.get('name'))} {target}"
 
     def _result(self, result: Mapping[str, Any]) -> None:
-        usage = usage_of(mapping(result.get("usage")))
+        usage = usage_of(result, _TOKENS) or Usage()
         if usage.total >= self.usage.total:
             self.usage = usage
         text = string(result.get("result"))
@@ -136,13 +140,3 @@ class ClaudeReader(TurnReader):
         status = result.get("api_error_status")
         message = text or "; ".join(words) or string(result.get("subtype")).replace("_", " ")
         self.failure = turn_failure_of(message, status if isinstance(status, int) else None)
-
-
-def usage_of(counts: Mapping[str, Any]) -> Usage:
-    """The paper's token counts from a `usage` object."""
-    return Usage(
-        input_noncached=count(counts.get("input_tokens")),
-        cache_read=count(counts.get("cache_read_input_tokens")),
-        cache_creation=count(counts.get("cache_creation_input_tokens")),
-        output=count(counts.get("output_tokens")),
-    )

@@ -21,7 +21,7 @@ from typing import Any, Literal
 
 import msgspec
 
-from evopolicy_common.errors import ConfigError
+from evopolicy_common.errors import ConfigError, EvopolicyError
 from evopolicy_common.logs import structlog
 from evopolicy_gateway.harnesses.coding_agents import session
 from evopolicy_gateway.harnesses.coding_agents.dialect import Dialect, TurnReader, first_line
@@ -29,10 +29,11 @@ from evopolicy_gateway.harnesses.coding_agents.session import SessionState
 from evopolicy_gateway.harnesses.coding_agents.turn import Capped, play_turn
 from evopolicy_gateway.harnesses.coding_agents.turn_failure import TurnFailure, backoff_s
 from evopolicy_gateway.harnesses.interface.agent_config import relay_variables
-from evopolicy_gateway.harnesses.interface.base import AgentError, Harness, ModelTerms, RelayAddress, Stage
+from evopolicy_gateway.harnesses.interface.base import AgentError, Harness, RelayAddress, Stage
 from evopolicy_gateway.inputs import own_config
 from evopolicy_gateway.inputs.kept import Kept
 from evopolicy_gateway.processes.child_messages import AgentDoing, AgentEnded
+from evopolicy_gateway.relay.limits import ModelTerms
 from evopolicy_gateway.relay.usage import Usage
 
 _PROBE_TIMEOUT_S = 60.0
@@ -79,9 +80,7 @@ class CliAgent(Harness):
         self._dialect.kept = kept
 
     def check(self, env: str) -> None:
-        environment = os.environ | self._dialect.environment() | self._config.environment
-        if (missing := self._missing(environment)) is not None:
-            raise ConfigError(missing)
+        self._check_program(os.environ | self._dialect.environment() | self._config.environment, ConfigError)
 
     async def play(self, stage: Stage) -> AgentEnded:
         self._config.check(stage.environment)
@@ -115,7 +114,6 @@ class CliAgent(Harness):
         return msgspec.structs.replace(stage, environment=kept)
 
     async def _turn(self, stage: Stage, prompt: str) -> TurnReader:
-        """Runs one turn and records its usage."""
         dialect, state = self._dialect, self._state
         resume = state.session is not None and dialect.resumes
         begun = state.session if resume else str(uuid.uuid4()) if dialect.makes_session_id else None
@@ -149,7 +147,7 @@ class CliAgent(Harness):
         resume = self._state.session is not None and dialect.resumes
         arguments = dialect.arguments(session, resume=resume, prompt=prompt, options=self._options)
         program = [*self._program, *arguments]
-        await play_turn(stage, dialect, program, prompt, reader, self._config.silence_s, capped)
+        await play_turn(stage, dialect, program, prompt, reader, capped)
 
     async def _done(self, stage: Stage, reader: TurnReader) -> AgentEnded | str:
         """The next prompt after a completed turn, or the end."""
@@ -165,9 +163,8 @@ class CliAgent(Harness):
             return self._ending()
         if state.reprompts >= self._config.reprompts:
             remaining = "budget" if n_left is None else f"{n_left} episodes"
-            return self._ending(
-                "agent_stopped", f"stopped with {remaining} left after {state.reprompts} reminders"
-            )
+            why = f"stopped with {remaining} left after {state.reprompts} reminders"
+            return self._ending("agent_stopped", why)
         state.reprompts += 1
         self._keep(stage)
         return stage.prompts.stopped(n_left) if self._dialect.resumes else stage.prompts.begin()
@@ -179,10 +176,8 @@ class CliAgent(Harness):
         message = stage.log.redact.text(failure.message)
         log.warning("turn failed", kind=failure.kind, message=message, failures=self._failures + 1)
         stage.log.note({"type": "turn_failed", "kind": failure.kind, "message": failure.message})
-        if failure.kind == "final":
-            return self._ending("agent_failed", message)
-        if failure.kind == "cap":
-            return self._ending("agent_stopped", message)
+        if failure.kind in ("final", "cap"):
+            return self._ending("agent_failed" if failure.kind == "final" else "agent_stopped", message)
         self._faulty = self._faulty + 1 if failure.kind == "faulty" else 0
         if self._faulty >= _MAX_FAULTY:
             return self._ending("agent_failed", f"{self._faulty} turns in a row ended by {message}")
@@ -196,10 +191,8 @@ class CliAgent(Harness):
         elif self._failures > config.retries:
             return self._ending("agent_failed", f"failed {self._failures} times in a row: {message}")
         elif failure.kind != "lost":
-            wait_s = max(
-                backoff_s(self._failures, config.backoff_s, random.random()),
-                min(failure.wait_s or 0.0, _MAX_PAUSE_S),
-            )
+            wait_s = backoff_s(self._failures, config.backoff_s, random.random())
+            wait_s = max(wait_s, min(failure.wait_s or 0.0, _MAX_PAUSE_S))
             told = f"retry {self._failures} in {wait_s:.0f} s: {message}"
             stage.on_doing(AgentDoing(action=told, note=told if self._failures == 1 else ""))
             await stage.sleep(wait_s)
@@ -226,8 +219,7 @@ class CliAgent(Harness):
     async def _prompt_after_failure(self, stage: Stage) -> AgentEnded | str:
         """The first prompt of a session, or the prompt that resumes an interrupted one; the end if the budget is
         spent."""
-        n_left = await episodes_left(stage)
-        if n_left == 0:
+        if (n_left := await episodes_left(stage)) == 0:
             return self._ending()
         if self._state.session is None or not self._dialect.resumes:
             return stage.prompts.begin()
@@ -249,33 +241,29 @@ class CliAgent(Harness):
             return f"cap reached: {cost:.2f} of {config.max_cost:.2f} dollars spent"
         return None
 
-    def _missing(self, environment: Mapping[str, str]) -> str | None:
-        """An error text if the program is missing, else None."""
+    def _check_program(self, environment: Mapping[str, str], wrong: type[EvopolicyError]) -> None:
         name, install = self._program[0], self._dialect.install
-        if shutil.which(name, path=environment.get("PATH")) is not None:
-            return None
-        advice = f"; install it with: {install}" if install else ""
-        return f"there is no program {name!r} on the PATH{advice}"
+        if shutil.which(name, path=environment.get("PATH")) is None:
+            advice = f"; install it with: {install}" if install else ""
+            raise wrong(f"there is no program {name!r} on the PATH{advice}")
 
     async def _probe(self, stage: Stage) -> None:
         """Finds the program, its version and its options. Raises AgentError that names what is missing."""
         name, dialect = self._program[0], self._dialect
-        if (missing := self._missing(stage.environment)) is not None:
-            raise AgentError(missing)
-        output = await self._ask(stage, dialect.version_args)
-        self._version = dialect.version_in(output)
+        self._check_program(stage.environment, AgentError)
+        self._version = dialect.version_in(await self._ask(stage, dialect.version_args))
         if not dialect.help_args:
             return
+        version = self._version or "of an unknown version"
         self._options = await self._ask(stage, dialect.help_args)
         missing_options = [option for option in dialect.required_options() if option not in self._options]
         if missing_options:
             raise AgentError(
-                f"{name} {self._version or 'of an unknown version'} has no {', '.join(missing_options)};"
+                f"{name} {version} has no {', '.join(missing_options)};"
                 f" known to work: {dialect.tested_version} ({dialect.install}@{dialect.tested_version});"
                 f" its help begins: {first_line(self._options) or '(empty)'}"
             )
         if self._version != dialect.tested_version:
-            version = self._version or "of an unknown version"
             note = f"{name} {version} is used; tested was {dialect.tested_version}"
             log.warning("another version than the tested one", version=version, tested=dialect.tested_version)
             stage.on_doing(AgentDoing(note=note))
@@ -307,22 +295,16 @@ class CliAgent(Harness):
             raise AgentError(f"{self._program[0]} does not answer {' '.join(arguments)}: {error}") from error
 
     def known(self) -> dict[str, Any]:
-        return {
-            "harness": self.name,
-            "model_string": self._config.model,
-            "settings": self._config.settings() | {"program": self._program},
-        }
+        settings = self._config.settings() | {"program": self._program}
+        return {"harness": self.name, "model_string": self._config.model, "settings": settings}
 
     def _ending(
         self, reason: Literal["agent_stopped", "agent_failed"] = "agent_stopped", detail: str = ""
     ) -> AgentEnded:
         state, config = self._state, self._config
         facts = self.known() | {"cli_version": self._version}
-        facts["settings"] |= {
-            "reprompted": state.reprompts,
-            "paused_s": round(state.paused_s, 1),
-            "requests_failed": state.requests_failed,
-        }
+        facts["settings"] |= {"reprompted": state.reprompts, "paused_s": round(state.paused_s, 1)}
+        facts["settings"]["requests_failed"] = state.requests_failed
         if self._dialect.tested_version not in ("", self._version):
             facts["settings"]["tested_version"] = self._dialect.tested_version
         if state.usage.total:

@@ -21,18 +21,25 @@ from evopolicy_gateway.harnesses.coding_agents.dialect import (
     mapping,
     mappings,
     string,
+    usage_of,
 )
 from evopolicy_gateway.harnesses.coding_agents.turn_failure import turn_failure_of
-from evopolicy_gateway.relay.usage import Usage, count
+from evopolicy_gateway.harnesses.interface.agent_config import TokenPaths
+from evopolicy_gateway.relay.usage import Usage
 
 _BYPASS = "--dangerously-bypass-approvals-and-sandbox"
 _ISOLATION = ("--ignore-user-config", "--ignore-rules")
+TOKENS = TokenPaths(
+    input="usage.input_tokens",
+    cache_read="usage.cached_input_tokens",
+    output="usage.output_tokens",
+    reasoning="usage.reasoning_output_tokens",
+    input_includes_cached=True,
+)
 _NOTICE = "Reconnecting"
 
 
 class Codex(Dialect):
-    """The dialect of `codex`."""
-
     name = "codex"
     program = ("codex",)
     cumulative = True
@@ -71,15 +78,13 @@ class Codex(Dialect):
 
 
 class CodexReader(TurnReader):
-    """Reads the stream of one `codex exec`."""
-
     def read(self, event: Mapping[str, Any]) -> None:
         kind = event.get("type")
         if kind == "thread.started":
             self.session = string(event.get("thread_id")) or None
         elif kind == "turn.completed":
             self.done, self.failure = True, None
-            self.usage = usage_of(mapping(event.get("usage")))
+            self.usage = usage_of(event, TOKENS) or Usage()
         elif kind == "turn.failed":
             self.done = False
             self.failure = turn_failure_of(string(mapping(event.get("error")).get("message")))
@@ -105,18 +110,6 @@ class CodexReader(TurnReader):
         elif kind == "file_change":
             paths = [string(one.get("path")) for one in mappings(item.get("changes"))]
             self.action = f"edits {', '.join(path.rpartition('/')[2] for path in paths)}"
-
-
-def usage_of(counts: Mapping[str, Any]) -> Usage:
-    """The paper's token counts from a `usage` object."""
-    cached = count(counts.get("cached_input_tokens"))
-    reasoning = counts.get("reasoning_output_tokens")
-    return Usage(
-        input_noncached=max(0, count(counts.get("input_tokens")) - cached),
-        cache_read=cached,
-        output=count(counts.get("output_tokens")),
-        reasoning=count(reasoning) if reasoning is not None else None,
-    )
 
 
 def _toml(value: str | tuple[str, ...]) -> str:

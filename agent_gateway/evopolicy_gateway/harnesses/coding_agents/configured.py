@@ -6,18 +6,16 @@ reported an error.
 
 from __future__ import annotations
 
-import itertools
 import re
 from collections.abc import Mapping
 from typing import Any
 
 from evopolicy_common.errors import ConfigError
-from evopolicy_gateway.harnesses.coding_agents.dialect import Dialect, TurnReader, first_line
+from evopolicy_gateway.harnesses.coding_agents.dialect import Dialect, TurnReader, first_line, usage_of
 from evopolicy_gateway.harnesses.coding_agents.turn_failure import turn_failure_of
 from evopolicy_gateway.harnesses.interface.agent_config import AgentConfig, Cli, Events
 from evopolicy_gateway.inputs.kept import MCP_FILE
-from evopolicy_gateway.relay.paths import values
-from evopolicy_gateway.relay.usage import Usage, count
+from evopolicy_gateway.relay.answers import values
 
 _MCP = {"{mcp_config}": MCP_FILE}
 
@@ -77,8 +75,6 @@ class ConfiguredCli(Dialect):
 
 
 class ConfiguredReader(TurnReader):
-    """Reads the stream of one turn of a configured CLI."""
-
     def __init__(self, events: Events) -> None:
         super().__init__()
         self._events = events
@@ -91,26 +87,9 @@ class ConfiguredReader(TurnReader):
             self.action = first_line(action)
         if error := _first(event, self._events.error):
             self.failure = turn_failure_of(error)
-        self._count(event)
-
-    def _count(self, event: Mapping[str, Any]) -> None:
         paths = self._events.tokens
-        counts: dict[str, int] = {}
-        for name in ("input", "cache_read", "cache_creation", "output", "reasoning", "total"):
-            numbers = (value for value in values(event, getattr(paths, name)) if isinstance(value, int))
-            for value in itertools.islice(numbers, 1):
-                counts[name] = count(value)
-        if not counts:
-            return
-        given, cached = counts.get("input", 0), counts.get("cache_read", 0)
-        usage = Usage(
-            input_noncached=max(0, given - (cached if paths.input_includes_cached else 0)),
-            cache_read=cached,
-            cache_creation=counts.get("cache_creation", 0),
-            output=max(counts.get("output", 0), counts.get("total", 0) - given),
-            reasoning=counts.get("reasoning"),
-        )
-        self.usage = usage if paths.counts == "session" else self.usage + usage
+        if (usage := usage_of(event, paths)) is not None:
+            self.usage = usage if paths.counts == "session" else self.usage + usage
 
 
 def _first(document: Mapping[str, Any], paths: tuple[str, ...]) -> str:

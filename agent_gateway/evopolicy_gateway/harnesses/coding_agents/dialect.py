@@ -6,16 +6,18 @@ decides by the reader's state whether the turn is complete, failed, or to be res
 
 from __future__ import annotations
 
+import itertools
 import re
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from typing import Any
 
 from evopolicy_gateway.harnesses.coding_agents.turn_failure import TurnFailure
-from evopolicy_gateway.harnesses.interface.agent_config import AgentConfig
+from evopolicy_gateway.harnesses.interface.agent_config import AgentConfig, TokenPaths
 from evopolicy_gateway.harnesses.interface.base import RelayAddress
 from evopolicy_gateway.inputs.kept import Kept
-from evopolicy_gateway.relay.usage import Usage
+from evopolicy_gateway.relay.answers import values
+from evopolicy_gateway.relay.usage import Usage, count
 
 _MAX_VERSION_CHARS = 2000
 _VERSION = re.compile(r"\d+\.\d+(?:\.\d+)?[\w.+-]*")
@@ -105,6 +107,25 @@ class Dialect(ABC):
         """The version in its `--version` output; None if there is none."""
         match = _VERSION.search(text[:_MAX_VERSION_CHARS])
         return match and match[0]
+
+
+def usage_of(event: Mapping[str, Any], paths: TokenPaths) -> Usage | None:
+    """The paper's token counts from an event of a stream, of which nothing is trusted; None without counts."""
+    counts: dict[str, int] = {}
+    for name in ("input", "cache_read", "cache_creation", "output", "reasoning", "total"):
+        numbers = (value for value in values(event, getattr(paths, name)) if isinstance(value, int))
+        for value in itertools.islice(numbers, 1):
+            counts[name] = count(value)
+    if not counts:
+        return None
+    given, cached = counts.get("input", 0), counts.get("cache_read", 0)
+    return Usage(
+        input_noncached=max(0, given - (cached if paths.input_includes_cached else 0)),
+        cache_read=cached,
+        cache_creation=counts.get("cache_creation", 0),
+        output=max(counts.get("output", 0), counts.get("total", 0) - given),
+        reasoning=counts.get("reasoning"),
+    )
 
 
 def mapping(value: Any) -> Mapping[str, Any]:

@@ -28,8 +28,6 @@ _TIMEOUT_S = 600.0
 
 
 class Llm(Dialect):
-    """The dialect of the built-in agent."""
-
     name = "llm"
     # -P: modules in the workspace, which the agent writes, must not shadow installed ones.
     program = (sys.executable, "-P", "-m", "evopolicy_gateway.agents.llm")

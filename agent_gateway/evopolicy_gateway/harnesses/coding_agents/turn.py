@@ -33,13 +33,12 @@ async def play_turn(
     program: list[str],
     prompt: str,
     reader: TurnReader,
-    silence_s: float,
     capped: Capped,
 ) -> None:
     """Runs one turn to its end. Raises AgentError when the program cannot be started."""
     stage.log.last_errors.clear()
     process = await stage.start(program, talks=dialect.prompt_on_stdin)
-    reading = asyncio.create_task(_read(stage, process, reader, silence_s, capped))
+    reading = asyncio.create_task(_read(stage, process, reader, dialect.config.silence_s, capped))
     feeding = asyncio.create_task(_feed(process, dialect.stdin(prompt))) if dialect.prompt_on_stdin else None
     ended = asyncio.create_task(process.ended())
     try:
@@ -53,15 +52,17 @@ async def play_turn(
         # The pipe may still hold the last lines; do not wait for a child that keeps it open.
         await asyncio.wait([reading], timeout=_PIPE_TIMEOUT_S)
     finally:
-        for task in (reading, feeding, ended):
-            if task is not None:
-                task.cancel()
-        await asyncio.gather(*(task for task in (reading, feeding, ended) if task), return_exceptions=True)
+        tasks = [task for task in (reading, feeding, ended) if task is not None]
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
         await process.close()
     if not dialect.tells_end and code == 0 and reader.failure is None:
         reader.done = True
     if not reader.done and reader.failure is None:
-        reader.failure = _crash(program[0], code, list(stage.log.last_errors))
+        how = f"exit status {code}" if code >= 0 else f"signal {-code}"
+        why = f"{program[0]} ended with {how} in the middle of its turn"
+        reader.failure = with_last_errors(why, list(stage.log.last_errors))
 
 
 async def _read(
@@ -100,9 +101,3 @@ async def _read(
 async def _feed(process: AgentProcess, prompt: str) -> None:
     await process.say(prompt.encode())
     process.hang_up()
-
-
-def _crash(program: str, code: int, errors: list[str]) -> TurnFailure:
-    """The failure of a program that ended without reporting how its turn ended."""
-    how = f"exit status {code}" if code >= 0 else f"signal {-code}"
-    return with_last_errors(f"{program} ended with {how} in the middle of its turn", errors)

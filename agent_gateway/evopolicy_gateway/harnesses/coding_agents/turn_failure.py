@@ -104,19 +104,15 @@ def backoff_s(attempt: int, base_s: float, chance: float) -> float:
 
 def _wait_in(text: str, now: float) -> float | None:
     """The waiting time stated in the text, seconds, finite; None if there is none."""
-    wait_s = _stated_wait(text, now)
-    return wait_s if wait_s is not None and math.isfinite(wait_s) else None
-
-
-def _stated_wait(text: str, now: float) -> float | None:
     if (seconds := _RESETS_IN.search(text)) is not None:
-        return float(seconds.group(1))
-    if (epoch := _EPOCH.search(text)) is not None:
-        return max(0.0, float(epoch.group(1)) - now)
-    if (match := _IN.search(text)) is None:
+        wait_s = float(seconds.group(1))
+    elif (epoch := _EPOCH.search(text)) is not None:
+        wait_s = max(0.0, float(epoch.group(1)) - now)
+    elif (match := _IN.search(text)) is not None:
+        parts = _PART.findall(match.group(1).lower())
+        units = ("ms" if unit.startswith("ms") else unit[0] for _, unit in parts)
+        wait_s = sum(float(part) * _UNITS.get(one, 0.0) for (part, _), one in zip(parts, units, strict=True))
+        wait_s = wait_s or math.inf  # no known unit
+    else:
         return None
-    total = 0.0
-    for number, unit in _PART.findall(match.group(1)):
-        name = unit.lower()
-        total += float(number) * _UNITS.get("ms" if name.startswith("ms") else name[0], 0.0)
-    return total or None
+    return wait_s if math.isfinite(wait_s) else None

@@ -207,14 +207,13 @@ class AgentConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     @property
     def secret(self) -> tuple[str, ...]:
         """Names of the operator's variables whose values are removed from the agent's log."""
-        key = self.api.variable if self.api is not None else ""
-        return tuple(dict.fromkeys((*self.pass_environment, *([key] if key else []))))
+        names = (*self.pass_environment, self.api.variable if self.api is not None else "")
+        return tuple(dict.fromkeys(filter(None, names)))
 
     def check(self, environment: Mapping[str, str] | None = None) -> None:
         """Raises ConfigError that names the wrong setting."""
         variables = os.environ if environment is None else environment
-        missing = [name for name in self.pass_environment if not variables.get(name)]
-        if missing:
+        if missing := [name for name in self.pass_environment if not variables.get(name)]:
             raise ConfigError(f"pass_environment: {', '.join(missing)} not set; export it before starting")
         key = "" if self.api is None else self.api.variable
         if key and not os.environ.get(key):
@@ -240,10 +239,11 @@ class AgentConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
             raise ConfigError(
                 f"skills_at = {self.skills_at!r}: give a folder of the agent's home, such as ~/.agents/skills"
             )
-        if self.cli is not None and self.effort and not any("{effort}" in word for word in self.cli.first):
+        cli = self.cli
+        if cli is not None and self.effort and not any("{effort}" in word for word in cli.first):
             raise ConfigError(f"effort = {self.effort!r}, and no argument in cli.first has {{effort}}")
-        if self.cli is not None and self.cli.prompt == "argument":
-            for name, words in (("first", self.cli.first), ("resume", self.cli.resume)):
+        if cli is not None and cli.prompt == "argument":
+            for name, words in (("first", cli.first), ("resume", cli.resume)):
                 if words and not any("{prompt}" in word for word in words):
                     raise ConfigError(f'cli.{name} has no {{prompt}}, and cli.prompt is "argument"')
 
@@ -281,16 +281,14 @@ class AgentConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     def provider_name(self) -> str:
         if self.provider is None and self.api is not None:
             return urlsplit(self.api.url).hostname or self.harness
-        return self.provider or {"codex": "openai", "claude-code": "anthropic"}.get(
-            self.harness, self.harness
-        )
+        own = _OWN_APIS.get(self.harness, (self.harness, ()))
+        return self.provider or own[0]
 
     def settings(self) -> dict[str, object]:
         """The part recorded in `run.json`."""
         kept = msgspec.to_builtins(self)
-        return {
-            name: value for name, value in kept.items() if value not in (None, [], {}) and name != "harness"
-        }
+        del kept["harness"]
+        return {name: value for name, value in kept.items() if value not in (None, [], {})}
 
 
 def _is_reachable(url: str) -> bool:
@@ -306,12 +304,10 @@ def _is_reachable(url: str) -> bool:
 
 def read_agent(path: Path) -> AgentConfig:
     """The settings in a TOML file. Raises ConfigError with the file and the fault."""
+    data = read_given(path, str(path))
     try:
-        config = msgspec.toml.decode(read_given(path, str(path)), type=AgentConfig)
-    except DECODE_ERRORS as error:
-        raise ConfigError(f"{path}: {error}") from error
-    try:
+        config = msgspec.toml.decode(data, type=AgentConfig)
         config.check()
-    except ConfigError as error:
+    except (ConfigError, *DECODE_ERRORS) as error:
         raise ConfigError(f"{path}: {error}") from error
     return config

@@ -26,9 +26,7 @@ from evopolicy_gateway.processes.agent_log import AgentLog
 from evopolicy_gateway.processes.agent_process import AgentProcess
 from evopolicy_gateway.processes.child_messages import AgentDoing, AgentEnded
 from evopolicy_gateway.processes.clock import Activity, AgentClock
-from evopolicy_gateway.relay.apis import Upstream
-from evopolicy_gateway.relay.limits import Limits
-from evopolicy_gateway.relay.usage import Prices
+from evopolicy_gateway.relay.limits import ModelTerms
 from evopolicy_gateway.workspace.prompts import Prompts
 
 _INFO_TIMEOUT_S = 30.0
@@ -104,19 +102,6 @@ class RelayAddress(msgspec.Struct, frozen=True, kw_only=True):
 
     url: str
     token: str
-
-
-class ModelTerms(msgspec.Struct, frozen=True, kw_only=True):
-    """The terms on which an agent may use its model."""
-
-    limits: Limits
-    prices: Prices | None = None
-    model: str | None = None
-    """The declared model."""
-    declared_only: bool = False
-    own_tools_only: bool = False
-    upstream: Upstream | None = None
-    """The API behind the relay; None: the agent cannot use the relay."""
 
 
 class Harness(ABC):

@@ -61,7 +61,7 @@ def the_key_is_set(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def used_in(record: RunRecord) -> tuple[ModelUse, Tokens]:
-    """What a run used of its model."""
+    """A run's use of its model."""
     assert record.agent.model_use is not None
     assert record.agent.tokens is not None
     return record.agent.model_use, record.agent.tokens
@@ -112,11 +112,11 @@ def test_the_key_is_nowhere_in_the_jail(tmp_path: Path, operator: Path, protocol
     record, api, _ = played(tmp_path, operator, [Step(command=search), *ENDS], protocol)
     assert used_in(record)[0].requests == api.n_asked == 5
     assert api.keys == {KEY if protocol == "anthropic" else f"Bearer {KEY}"}
-    found = json.dumps(api.requests[1])
-    assert "searched 0 []" in found
-    assert "EVOPOLICYGYM_SUBMIT_URL" in found
+    sent = json.dumps(api.requests[1])
+    assert "searched 0 []" in sent
+    assert "EVOPOLICYGYM_SUBMIT_URL" in sent
     # Its commands have the relay's token as little as the key.
-    assert "_API_KEY=" not in found
+    assert "_API_KEY=" not in sent
     assert KEY not in "".join(
         path.read_text(errors="replace") for path in (run_dir(tmp_path) / "logs").rglob("*") if path.is_file()
     )

@@ -23,21 +23,21 @@ def played(tmp_path: Path, scenario: str, budget: int = 4, **more: Any) -> Playe
     return play(tmp_path, settings("acp", program=PROGRAM, acp=AcpTable(), **more), scenario, budget=budget)
 
 
-def kept(found: Played, name: str) -> list[str]:
-    return (found.folder / "fake" / name).read_text().splitlines()
+def kept(run: Played, name: str) -> list[str]:
+    return (run.folder / "fake" / name).read_text().splitlines()
 
 
 def test_an_agent_that_stops_is_prompted_again_in_its_session(tmp_path: Path) -> None:
-    found = played(tmp_path, "work")
-    assert found.outcome == ("agent_stopped", 2, 0)
-    assert found.turns == [(1, "done 0"), (2, "done 1")]
-    assert found.ending.facts["cli_version"] == "fake 1.2"
-    tokens = found.ending.facts["tokens"]
+    run = played(tmp_path, "work")
+    assert run.outcome == ("agent_stopped", 2, 0)
+    assert run.turns == [(1, "done 0"), (2, "done 1")]
+    assert run.ending.facts["cli_version"] == "fake 1.2"
+    tokens = run.ending.facts["tokens"]
     assert (tokens["input_noncached"], tokens["cache_read"], tokens["output"]) == (60, 140, 20)
-    assert kept(found, "requests").count("session/new") == 1
-    assert any(doing.action == "$ submit" for doing in found.doings)
+    assert kept(run, "requests").count("session/new") == 1
+    assert any(doing.action == "$ submit" for doing in run.doings)
     # As the live page and the reports read it.
-    texts = [line["message"]["content"][0] for line in found.log if line.get("type") == "assistant"]
+    texts = [line["message"]["content"][0] for line in run.log if line.get("type") == "assistant"]
     assert [block.get("text", block.get("input")) for block in texts[:3]] == [
         "let me",
         {"command": "submit"},
@@ -61,18 +61,18 @@ def test_an_agent_that_stops_is_prompted_again_in_its_session(tmp_path: Path) ->
 def test_an_agent_that_fails_goes_on_in_a_session(
     tmp_path: Path, scenario: str, requests: dict[str, int], retries: int
 ) -> None:
-    found = played(tmp_path, scenario, silence_s=1.0)
-    assert found.outcome == ("agent_stopped", 2, retries), found.ending.detail
-    assert {name: kept(found, "requests").count(name) for name in requests} == requests
+    run = played(tmp_path, scenario, silence_s=1.0)
+    assert run.outcome == ("agent_stopped", 2, retries), run.ending.detail
+    assert {name: kept(run, "requests").count(name) for name in requests} == requests
     if scenario == "work,crash,work":
-        failed = next(line for line in found.log if line.get("type") == "turn_failed")
+        failed = next(line for line in run.log if line.get("type") == "turn_failed")
         assert "out of cheese" in failed["message"]
-        # What a loaded session repeats is not the new turn's text.
-        assert found.turns[-1] == (2, "done 2")
+        # A loaded session repeats texts that are not the new turn's.
+        assert run.turns[-1] == (2, "done 2")
     if scenario.endswith("load"):
-        assert found.prompts[-1]["message"].startswith("Read AGENTS.md")
+        assert run.prompts[-1]["message"].startswith("Read AGENTS.md")
     if "deep" in scenario:
-        assert {"type": "user", "text": "nested too deeply to be kept"} in found.log
+        assert {"type": "user", "text": "nested too deeply to be kept"} in run.log
     # An agent that reads no answers, to 20 MB of requests, is not read either: what was read stands in the log.
     assert (tmp_path / "agent.jsonl").stat().st_size < 4 << 20
 
@@ -82,8 +82,8 @@ def test_a_setting_that_can_be_neither_chosen_nor_seen_ends_the_run(tmp_path: Pa
     setting: dict[str, Any] = {name: "some-value"}
     with pytest.raises(AgentError, match=f"put the {name} into `program`"):
         played(tmp_path / "a", "work", **setting)
-    found = played(tmp_path / "b", "work", extra_args=(f"--{name}=some-value",), **setting)
-    assert found.ending.reason == "agent_stopped"
+    run = played(tmp_path / "b", "work", extra_args=(f"--{name}=some-value",), **setting)
+    assert run.ending.reason == "agent_stopped"
 
 
 def test_a_session_plays_in_the_mode_that_asks_permission(tmp_path: Path) -> None:
@@ -108,30 +108,30 @@ def test_a_session_plays_in_the_mode_that_asks_permission(tmp_path: Path) -> Non
 def test_a_model_is_chosen_by_its_id_or_its_name(
     tmp_path: Path, model: str, args: tuple[str, ...], chosen: list[str]
 ) -> None:
-    found = played(tmp_path, "work,options", model=model, extra_args=args)
-    assert kept(found, "chosen") == chosen
+    run = played(tmp_path, "work,options", model=model, extra_args=args)
+    assert kept(run, "chosen") == chosen
 
 
 def test_requests_that_cannot_be_answered_are_not_logged_one_by_one(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    found = played(tmp_path, "deepid,work")
-    assert (found.ending.reason, found.ending.turns) == ("agent_stopped", 2)
+    run = played(tmp_path, "deepid,work")
+    assert (run.ending.reason, run.ending.turns) == ("agent_stopped", 2)
     assert [record.message for record in caplog.records if record.exc_info] == []
 
 
 def test_an_agent_that_is_not_logged_in_ends_the_run(tmp_path: Path) -> None:
-    found = played(tmp_path, "login")
-    assert found.ending.reason == "agent_failed"
-    assert "not logged in" in found.ending.detail
+    run = played(tmp_path, "login")
+    assert run.ending.reason == "agent_failed"
+    assert "not logged in" in run.ending.detail
 
 
 def test_permissions_follow_the_rules_and_this_side_is_out_of_reach(tmp_path: Path) -> None:
-    found = played(tmp_path, "asks", budget=2)
-    answers = [line.rpartition(" ")[2] for line in kept(found, "permissions")]
+    run = played(tmp_path, "asks", budget=2)
+    answers = [line.rpartition(" ")[2] for line in kept(run, "permissions")]
     assert answers == ["reject_once", "reject_once", "reject_once", "allow_once", "allow_once"]
-    assert all("Method not found" in line for line in kept(found, "refused"))
-    assert [line["outcome"] for line in found.log if line.get("type") == "permission"] == ["selected"] * 5
+    assert all("Method not run" in line for line in kept(run, "refused"))
+    assert [line["outcome"] for line in run.log if line.get("type") == "permission"] == ["selected"] * 5
 
 
 def test_an_option_that_is_not_offered_is_not_chosen() -> None:
@@ -188,7 +188,7 @@ def test_odd_updates_are_skipped() -> None:
     assert (reader.done, reader.text, reader.usage) == (False, "", Usage())
 
 
-def test_what_is_remembered_of_a_turn_is_bounded() -> None:
+def test_the_memory_of_a_turn_is_bounded() -> None:
     reader = AcpReader()
     large = {"text": "x" * (300 << 10)}
     for n in range(1000):

@@ -6,6 +6,7 @@ from __future__ import annotations
 import json
 import sys
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import pytest
@@ -16,9 +17,10 @@ from stages.cli_stage import FAKES, play, settings
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.records.secrets import Redaction
 from evopolicy_gateway.harnesses import make
+from evopolicy_gateway.harnesses.coding_agents import codex
 from evopolicy_gateway.harnesses.coding_agents.claude_code import ClaudeReader
-from evopolicy_gateway.harnesses.coding_agents.codex import usage_of
 from evopolicy_gateway.harnesses.coding_agents.configured import ConfiguredCli, ConfiguredReader, values
+from evopolicy_gateway.harnesses.coding_agents.dialect import usage_of
 from evopolicy_gateway.harnesses.coding_agents.turn_failure import MAX_BACKOFF_S, backoff_s, turn_failure_of
 from evopolicy_gateway.harnesses.interface.agent_config import (
     AgentConfig,
@@ -52,7 +54,7 @@ EXAMPLES = Path(__file__).parents[4] / "examples" / "agents"
         ("Segmentation fault", None, "passing", False),
     ],
 )
-def test_what_a_cli_says_decides_what_follows(
+def test_the_words_of_a_cli_decide_the_kind_of_failure(
     message: str, status: int | None, kind: str, provider: bool
 ) -> None:
     failure = turn_failure_of(message, status, now=1.0)
@@ -108,8 +110,12 @@ def test_redaction_takes_time_that_grows_with_a_lines_length(piece: str) -> None
     Redaction(["secret-word"])((piece * (LONG // len(piece))).encode())
 
 
+def in_codex(counts: dict[str, Any]) -> Usage:
+    return usage_of({"usage": counts}, codex.TOKENS) or Usage()
+
+
 def test_counts_of_tokens_are_bounded() -> None:
-    usage = usage_of({"input_tokens": 10**400, "cached_input_tokens": -1, "output_tokens": 1 << 70})
+    usage = in_codex({"input_tokens": 10**400, "cached_input_tokens": -1, "output_tokens": 1 << 70})
     assert (usage.input_noncached, usage.cache_read, usage.output) == (MAX_COUNT, 0, MAX_COUNT)
 
 
@@ -129,9 +135,9 @@ def test_messages_of_claude_are_counted_once_each_however_many_there_are() -> No
 
 def test_cached_input_is_taken_off_in_codex_streams() -> None:
     counts = {"input_tokens": 10, "cached_input_tokens": 7, "output_tokens": 3, "reasoning_output_tokens": 2}
-    usage = usage_of(counts)
+    usage = in_codex(counts)
     assert (usage.input_noncached, usage.cache_read, usage.output, usage.reasoning) == (3, 7, 3, 2)
-    assert usage_of({"input_tokens": True, "output_tokens": "x"}).total == 0
+    assert in_codex({"input_tokens": True, "output_tokens": "x"}).total == 0
 
 
 @given(
@@ -281,7 +287,7 @@ def test_an_event_counts_only_where_its_path_allows_it() -> None:
     reader.read({"type": "message", "role": "user", "content": "the prompt"})
     assert (reader.failure, reader.text) == (None, "")
     reader.read({"type": "message", "role": "assistant", "content": "done"})
-    # What is counted above input and output is reasoning.
+    # Tokens beyond input and output are reasoning.
     reader.read({"type": "result", "u": {"in": 10, "cached": 4, "out": 2, "all": 15}})
     assert (reader.text, reader.usage) == ("done", Usage(input_noncached=6, cache_read=4, output=5))
     reader.read({"type": "result", "error": {"message": "429 too many requests"}})

@@ -179,7 +179,7 @@ def test_keys_do_not_reach_the_log(tmp_path: Path, harness: str, monkeypatch: py
 
 
 @both
-def test_what_was_killed_goes_on_in_its_session(tmp_path: Path, harness: str) -> None:
+def test_a_killed_agent_goes_on_in_its_session(tmp_path: Path, harness: str) -> None:
     config = settings(harness)
     first = play(tmp_path, config, "work,endless", budget=9, over_when=thinks_without_end)
     kept = session.load(tmp_path / "session.json")

@@ -82,7 +82,7 @@ CHATTERS = "import time\nwhile True: print('working on it', flush=True); time.sl
 
 
 @pytest.mark.parametrize("code", [*IDLE, ANSWERS_ONLY, CHATTERS])
-def test_a_program_that_does_nothing_is_found_silent(tmp_path: Path, code: str) -> None:
+def test_a_program_that_does_nothing_counts_as_silent(tmp_path: Path, code: str) -> None:
     ending, _, _ = play(tmp_path, code, silence_s=1.5)
     assert ending.reason == "silent"
     assert "for 1.5 s it asked for no submit" in ending.detail
@@ -183,7 +183,7 @@ WRONG += ["command:no-such-program-x", "command:python3 no_such_script.py", "com
 
 
 @pytest.mark.parametrize("agent", WRONG)
-def test_what_is_no_agent_is_refused_with_what_there_is(agent: str, tmp_path: Path) -> None:
+def test_a_text_that_is_no_agent_is_refused_with_the_forms(agent: str, tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="--agent"):
         make(agent, tmp_path)
 

@@ -50,41 +50,41 @@ def test_a_model_edits_submits_and_is_prompted_again_in_its_session(
 ) -> None:
     prices = Prices(input=1.0, output=10.0, cache_read=0.1)
     script = [Step(command=SUBMIT), Step(text="first"), Step(command=SUBMIT), Step(text="second")]
-    found, api = played(tmp_path, protocol, script, prices=prices)
-    assert found.outcome == ("agent_stopped", 2, 0), found.ending.detail
-    assert found.turns == [(1, "first"), (2, "second")]
+    run, api = played(tmp_path, protocol, script, prices=prices)
+    assert run.outcome == ("agent_stopped", 2, 0), run.ending.detail
+    assert run.turns == [(1, "first"), (2, "second")]
     assert (tmp_path / "workspace/system/policy.py").read_text() == "# better\n# better\n"
-    tokens = found.ending.facts["tokens"]
+    tokens = run.ending.facts["tokens"]
     assert tokens["input_noncached"] == 4 * (INPUT - CACHED)
     assert (tokens["cache_read"], tokens["output"]) == (4 * CACHED, 4 * OUTPUT)
     assert tokens["cache_creation"] == (4 * CREATED if protocol == "anthropic" else 0)
     assert tokens["cost"] == pytest.approx(4 * (INPUT - CACHED + 0.1 * CACHED + 10 * OUTPUT) / 1e6)
-    assert any(doing.action.startswith("$ echo '# better'") for doing in found.doings)
-    assert protocol in found.ending.facts["cli_version"]
+    assert any(doing.action.startswith("$ echo '# better'") for doing in run.doings)
+    assert protocol in run.ending.facts["cli_version"]
     # The second turn knows the first: one session.
     assert "first" in str(api.requests[2])
 
 
 @mostly_one
 def test_neither_its_commands_nor_its_log_have_the_key(tmp_path: Path, protocol: Protocol) -> None:
-    found, api = played(tmp_path, protocol, [Step(command="env"), Step(text="done")], reprompts=0)
+    run, api = played(tmp_path, protocol, [Step(command="env"), Step(text="done")], reprompts=0)
     assert "EVOPOLICYGYM_SUBMIT_URL" in str(api.requests[1])
     assert KEY not in str(api.requests)
-    assert KEY not in found.text
+    assert KEY not in run.text
 
 
 @mostly_one
 def test_a_busy_provider_is_asked_again_within_the_turn(tmp_path: Path, protocol: Protocol) -> None:
     script = [Step(status=503, text="overloaded"), Step(command=SUBMIT), Step(command=SUBMIT)]
-    found, _ = played(tmp_path, protocol, [*script, Step(text="done")])
-    assert (found.ending.reason, found.ending.retries) == ("agent_stopped", 0), found.ending.detail
+    run, _ = played(tmp_path, protocol, [*script, Step(text="done")])
+    assert (run.ending.reason, run.ending.retries) == ("agent_stopped", 0), run.ending.detail
 
 
 @mostly_one
 def test_a_wrong_key_ends_the_run_with_the_providers_words(tmp_path: Path, protocol: Protocol) -> None:
-    found, _ = played(tmp_path, protocol, [Step(status=401, text="no such key")] * 9)
-    assert found.ending.reason == "agent_failed"
-    assert "no such key" in found.ending.detail
+    run, _ = played(tmp_path, protocol, [Step(status=401, text="no such key")] * 9)
+    assert run.ending.reason == "agent_failed"
+    assert "no such key" in run.ending.detail
 
 
 KNOWN = {"model": "m-1", "system": "", "parameters": {}, "retries": 0, "timeout_s": 9.0}
@@ -108,9 +108,9 @@ def test_an_answer_of_another_form_is_an_error_that_says_so(protocol: Protocol, 
 
 def test_a_session_that_failed_before_its_first_answer_begins_anew(tmp_path: Path) -> None:
     outage = [Step(status=503, text="overloaded")] * 5
-    found, _ = played(tmp_path, "openai", [*outage, Step(command=SUBMIT), Step(command=SUBMIT)])
-    assert (found.ending.reason, found.ending.retries) == ("agent_stopped", 1)
-    assert [prompt["message"][:14] for prompt in found.prompts] == ["Read AGENTS.md"] * 2
+    run, _ = played(tmp_path, "openai", [*outage, Step(command=SUBMIT), Step(command=SUBMIT)])
+    assert (run.ending.reason, run.ending.retries) == ("agent_stopped", 1)
+    assert [prompt["message"][:14] for prompt in run.prompts] == ["Read AGENTS.md"] * 2
 
 
 @mostly_one
@@ -119,8 +119,8 @@ def test_a_conversation_beyond_the_models_context_goes_on_without_old_outputs(
 ) -> None:
     commands = [Step(command=f"echo output-{n}-of-a-command") for n in range(12)]
     too_long = Step(status=400, text="prompt is too long: context length exceeded")
-    found, api = played(tmp_path, protocol, [*commands, too_long, Step(text="done")], reprompts=0)
-    assert found.turns == [(1, "done")]
+    run, api = played(tmp_path, protocol, [*commands, too_long, Step(text="done")], reprompts=0)
+    assert run.turns == [(1, "done")]
     assert "output-0-of" in str(api.requests[-2])
     last = str(api.requests[-1]["messages"])
     assert "[exit status 0]\\noutput-0-of" not in last

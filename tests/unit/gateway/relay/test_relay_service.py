@@ -385,7 +385,7 @@ def head_of(monkeypatch: pytest.MonkeyPatch, base: str, proxy: str, no_proxy: st
         provider = Provider(url, 10.0)
         async with provider.sent("POST", f"{url}/responses", {"x-team": "é"}, b"{}") as answer:
             assert (answer.status, answer.headers["x-odd"]) == (200, "é")
-            assert b"".join([piece async for piece in answer.pieces()]) == b"ok"
+            assert b"".join([piece async for piece in answer.pieces]) == b"ok"
         await provider.close()
         server.close()
 
