@@ -103,7 +103,8 @@ class Of(NamedTuple):
 
 
 def spread(command: Callable[..., None]) -> Callable[..., None]:
-    """The command as typer is to see it: with an option for each parameter and each field of a Struct."""
+    """The command as typer is to see it: with an option for each parameter and each field of a Struct. Our errors end
+    it with one line."""
     parameters: list[inspect.Parameter] = []
     groups: dict[str, tuple[Any, list[str]]] = {}
     parsed: dict[str, Callable[[Any], Any]] = {}
@@ -127,9 +128,9 @@ def spread(command: Callable[..., None]) -> Callable[..., None]:
         with fail_on_our_errors():
             for name, parse in parsed.items():
                 values[name] = parse(values[name] or ())
-        for name, (group, fields) in groups.items():
-            values[name] = group(**{field: values.pop(field) for field in fields})
-        command(**values)
+            for name, (group, fields) in groups.items():
+                values[name] = group(**{field: values.pop(field) for field in fields})
+            command(**values)
 
     flat.__name__, flat.__doc__ = command.__name__, command.__doc__
     flat.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]

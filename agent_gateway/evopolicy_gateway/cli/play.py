@@ -56,23 +56,22 @@ def run(
     Opens the run at the coordinator, starts its gateway and its agent on this machine, and ends when run.json is
     written.
     """
-    with fail_on_our_errors():
-        if local and (connect or credentials_file):
-            raise ConfigError(
-                "--local starts a cluster of its own; it cannot be combined with --connect or --credentials"
-            )
-        if not local and (cluster.data is not None or cluster.state is not None or cluster.fresh):
-            raise ConfigError(
-                "--data, --state and --fresh apply only with --local; otherwise set them at the coordinator:"
-                " evopolicy-coordinator --data, --state"
-            )
-        if local:
-            check_installed(LOCAL)
-        where = options.cluster_of(cluster, connect, credentials_file, local=local)
-        held = jail.of_remote_agent() if given.agent == listener.AGENT else jail
-        agent_host = listener.agent_host_of(given.agent, served.agent_host)
-        plans = _plans(given, [one_environment(env)], agent_host, jail=held, listener=served.listener())
-        _play(plans, msgspec.structs.replace(where, patient=given.resume and not local), 1, as_json, web=web)
+    if local and (connect or credentials_file):
+        raise ConfigError(
+            "--local starts a cluster of its own; it cannot be combined with --connect or --credentials"
+        )
+    if not local and (cluster.data is not None or cluster.state is not None or cluster.fresh):
+        raise ConfigError(
+            "--data, --state and --fresh apply only with --local; otherwise set them at the coordinator:"
+            " evopolicy-coordinator --data, --state"
+        )
+    if local:
+        check_installed(LOCAL)
+    where = options.cluster_of(cluster, connect, credentials_file, local=local)
+    held = jail.of_remote_agent() if given.agent == listener.AGENT else jail
+    agent_host = listener.agent_host_of(given.agent, served.agent_host)
+    plans = _plans(given, [one_environment(env)], agent_host, jail=held, listener=served.listener())
+    _play(plans, msgspec.structs.replace(where, patient=given.resume and not local), 1, as_json, web=web)
 
 
 @app.command(epilog="Example: evopolicy local --env core16 --agent evolve --budget 8 --parallel 2")
@@ -93,11 +92,10 @@ def local(
 
     Starts a coordinator and a worker, plays one run for each environment, and stops everything at the end.
     """
-    with fail_on_our_errors():
-        check_installed(LOCAL)
-        plans = _plans(given, catalogue.resolve(env), jail=jail)
-        where = options.cluster_of(cluster, None, None, local=True)
-        _play(plans, where, parallel, as_json, web=web)
+    check_installed(LOCAL)
+    plans = _plans(given, catalogue.resolve(env), jail=jail)
+    where = options.cluster_of(cluster, None, None, local=True)
+    _play(plans, where, parallel, as_json, web=web)
 
 
 @app.command(epilog="Example: evopolicy demo")
@@ -112,12 +110,11 @@ def demo(
 
     The run directory is runs/evolve/gym_continuouscar/demo; the next demo replaces it.
     """
-    with fail_on_our_errors():
-        check_installed(LOCAL)
-        given = RunOptions(agent="evolve", budget=32, exp_id="demo", overwrite=True, runs=runs)
-        plans = _plans(given, ["gym/continuouscar"])
-        where = options.cluster_of(ClusterOptions(slots=slots), None, None, local=True)
-        _play(plans, where, 1, as_json)
+    check_installed(LOCAL)
+    given = RunOptions(agent="evolve", budget=32, exp_id="demo", overwrite=True, runs=runs)
+    plans = _plans(given, ["gym/continuouscar"])
+    where = options.cluster_of(ClusterOptions(slots=slots), None, None, local=True)
+    _play(plans, where, 1, as_json)
 
 
 @app.command(
@@ -153,17 +150,16 @@ def try_policy(
     # With numpy, which a command that plays runs does without.
     from evopolicy_gateway.operator import trials
 
-    with fail_on_our_errors():
-        env_id, ids = one_environment(env), cases_of(cases)
-        policy = shipped.found(policy_dir, Path.cwd())
-        if not (connect or credentials_file):
-            packages = list(packages_for(policy, cluster.policy_package))
-            cluster = msgspec.structs.replace(cluster, policy_package=packages)
-        where = options.cluster_of(cluster, connect, credentials_file)
-        where = msgspec.structs.replace(where, unjailed=tier == "none")
-        where.check_ids([env_id], "train", ids)
-        given: dict[str, Any] = {"sandbox_tier": tier, "limits": limits, "as_json": as_json}
-        raise typer.Exit(run_to_end(trials.try_policy(env_id, policy, ids, out, where, **given)))
+    env_id, ids = one_environment(env), cases_of(cases)
+    policy = shipped.found(policy_dir, Path.cwd())
+    if not (connect or credentials_file):
+        packages = list(packages_for(policy, cluster.policy_package))
+        cluster = msgspec.structs.replace(cluster, policy_package=packages)
+    where = options.cluster_of(cluster, connect, credentials_file)
+    where = msgspec.structs.replace(where, unjailed=tier == "none")
+    where.check_ids([env_id], "train", ids)
+    given: dict[str, Any] = {"sandbox_tier": tier, "limits": limits, "as_json": as_json}
+    raise typer.Exit(run_to_end(trials.try_policy(env_id, policy, ids, out, where, **given)))
 
 
 @app.command("random", epilog="Example: evopolicy random --env gym/acrobot --split heldout")
@@ -184,12 +180,11 @@ def play_random(
     """
     from evopolicy_gateway.operator import trials
 
-    with fail_on_our_errors():
-        chosen = None if cases is None else cases_of(cases)
-        where = options.cluster_of(cluster, connect, credentials_file)
-        env_ids = catalogue.resolve(env)
-        where.check_ids(env_ids, split, chosen or ())
-        raise typer.Exit(run_to_end(trials.play_random(env_ids, split, chosen, where, as_json=as_json)))
+    chosen = None if cases is None else cases_of(cases)
+    where = options.cluster_of(cluster, connect, credentials_file)
+    env_ids = catalogue.resolve(env)
+    where.check_ids(env_ids, split, chosen or ())
+    raise typer.Exit(run_to_end(trials.play_random(env_ids, split, chosen, where, as_json=as_json)))
 
 
 def _tell_left_out(wanted: bool) -> None:
@@ -253,15 +248,14 @@ def replay(
     No model is asked, and no key is needed. Prints `identical`, or the first place that differs, with exit code 1.
     Starts a local cluster unless --connect or --credentials name one.
     """
-    with fail_on_our_errors():
-        plan = recorded_agent.plan_of(folder_of(run_directory).root, runs, trusted=trust)
-        plan.check()
-        where = options.cluster_of(cluster, connect, credentials_file)
-        try:
-            run_to_end(plain_runs.play([plan], where, 1, terminal(stderr=True)))
-        except KeyboardInterrupt:
-            fail("interrupted", 130)
-        difference = recorded_agent.outcome(run_directory, plan)
+    plan = recorded_agent.plan_of(folder_of(run_directory).root, runs, trusted=trust)
+    plan.check()
+    where = options.cluster_of(cluster, connect, credentials_file)
+    try:
+        run_to_end(plain_runs.play([plan], where, 1, terminal(stderr=True)))
+    except KeyboardInterrupt:
+        fail("interrupted", 130)
+    difference = recorded_agent.outcome(run_directory, plan)
     say_lines(difference.splitlines() or ["identical"])
     raise typer.Exit(int(bool(difference)))
 
@@ -291,8 +285,9 @@ def _plans(given: RunOptions, env_ids: list[str], agent_host: str = "", **more: 
 
 
 def _play(plans: list[Plan], where: Cluster, parallel: int, as_json: bool, *, web: bool = False) -> None:
-    known = {"unjailed": _unjailed(plans), "web": plans[0].runs if web else None}
-    where = msgspec.structs.replace(where, **known)
+    # Whether an agent or a policy could read what this user can.
+    unjailed = any(plan.jail.mode != "bwrap" or plan.settings.sandbox_tier == "none" for plan in plans)
+    where = msgspec.structs.replace(where, unjailed=unjailed, web=plans[0].runs if web else None)
     console = terminal(stderr=as_json)
     try:
         played = run_to_end(plain_runs.play(plans, where, parallel, console))
@@ -303,8 +298,3 @@ def _play(plans: list[Plan], where: Cluster, parallel: int, as_json: bool, *, we
     else:
         plain_runs.report(played, plans[0].runs, console)
     raise typer.Exit(exit_code(plans, played.index))
-
-
-def _unjailed(plans: list[Plan]) -> bool:
-    """Whether an agent or a policy could read what this user can."""
-    return any(plan.jail.mode != "bwrap" or plan.settings.sandbox_tier == "none" for plan in plans)

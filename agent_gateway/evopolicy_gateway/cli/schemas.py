@@ -61,10 +61,9 @@ def schema(name: str) -> dict[str, Any]:
         raise ConfigError(f"no schema {name!r}; there are {', '.join(KINDS)}")
     (root,), components = msgspec.json.schema_components([kind.type], ref_template="#/$defs/{name}")
     for each in _structs(kind.type):
-        described = components[each.__name__]
-        for field, text in field_texts(each).items():
-            if field in described["properties"]:
-                described["properties"][field]["description"] = text
+        properties, texts = components[each.__name__]["properties"], field_texts(each)
+        for field in properties.keys() & texts.keys():
+            properties[field]["description"] = texts[field]
     return {
         "$schema": DIALECT,
         "$id": f"urn:evopolicy:schema:{name}:{kind.version}",
@@ -78,19 +77,16 @@ def schema(name: str) -> dict[str, Any]:
 def _structs(root: type[msgspec.Struct]) -> list[type[msgspec.Struct]]:
     """The struct types that a type holds, itself first, in the order of its fields."""
     structs: dict[type[msgspec.Struct], None] = {}
-
-    def visit(each: Any) -> None:
-        if isinstance(each, tuple):
-            for one in each:
-                visit(one)
-        elif isinstance(each, msgspec.inspect.StructType):
-            if each.cls not in structs:
-                structs[each.cls] = None
-                visit(tuple(field.type for field in each.fields))
+    open_types: list[Any] = [msgspec.inspect.type_info(root)]
+    while open_types:
+        each = open_types.pop()
+        inner: Any = each if isinstance(each, tuple) else ()
+        if isinstance(each, msgspec.inspect.StructType):
+            inner = [field.type for field in each.fields if each.cls not in structs]
+            structs[each.cls] = None
         elif isinstance(each, msgspec.inspect.Type):
-            visit(msgspec.structs.astuple(each))
-
-    visit(msgspec.inspect.type_info(root))
+            inner = msgspec.structs.astuple(each)
+        open_types += reversed(inner)
     return list(structs)
 
 

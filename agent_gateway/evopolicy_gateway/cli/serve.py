@@ -98,10 +98,7 @@ def _failures_in_the_log() -> Iterator[None]:
         raise SystemExit(code_of(error)) from error
     except Exception as error:
         why = foreseen(error)
-        if why is None:
-            log.exception("the gateway failed", error=str(error))
-        else:
-            log.error("the gateway failed", error=why)
+        log.error("the gateway failed", error=str(error) if why is None else why, exc_info=why is None)
         raise SystemExit(FAILURE) from error
 
 
@@ -114,11 +111,10 @@ async def _serve(
     def ready(urls: Urls, pipeline: SubmitPipeline) -> None:
         variables = urls.environment() | workspace.variables(known[0])
         if controlled:
-            opened, held_s = pipeline.machine.run, round(pipeline.machine.held_s, 3)
-            notes: tuple[str, ...] = ()
-            if opened.video != "off" and not opened.env.renders:
-                notes = (f"--video {opened.video}: {opened.env.env} does not render; there are no videos",)
-            times = {"held_s": held_s, "permit_s": round(gateway.permit_s, 3)}
+            opened = pipeline.machine.run
+            why = f"--video {opened.video}: {opened.env.env} does not render; there are no videos"
+            notes = (why,) if opened.video != "off" and not opened.env.renders else ()
+            times = {"held_s": round(pipeline.machine.held_s, 3), "permit_s": round(gateway.permit_s, 3)}
             child_messages.emit(Ready(variables=urls.environment(), notes=notes, **times))
         elif json_output:
             print(orjson.dumps(variables).decode(), flush=True)
@@ -172,9 +168,8 @@ def progress_of(machine: TicketMachine) -> Progress:
     settled = [ticket for ticket in machine.tickets if ticket.status is not None]
     means = [ticket.mean for ticket in settled if ticket.mean is not None]
     running, last = machine.in_flight, settled[-1] if settled else None
-    now: dict[str, Any] = {}
-    if running is not None:
-        now = {name: getattr(running, name) for name in ("submit_id", "n_episodes", "n_done", "waits_for")}
+    fields = () if running is None else ("submit_id", "n_episodes", "n_done", "waits_for")
+    now: dict[str, Any] = {name: getattr(running, name) for name in fields}
     return Progress(
         episode_budget=machine.run.episode_budget,
         remaining_budget=machine.state.remaining_budget,

@@ -20,7 +20,6 @@ from evopolicy_common.cli.conventions import (
     CredentialsFile,
     bytes_text,
     fail,
-    fail_on_our_errors,
     run_to_end,
 )
 from evopolicy_common.cli.frame import App
@@ -91,31 +90,30 @@ def suite(
 
     After an interruption, repeat the command to continue the sweep.
     """
-    with fail_on_our_errors():
-        if local and (connect or credentials_file):
-            raise ConfigError("--local starts a cluster of its own; it cannot be combined with --connect")
-        where = options.cluster_of(cluster, connect, credentials_file, local=local)
-        wanted = suite_file.read(file)
-        if parallel is not None:
-            limits = msgspec.structs.replace(wanted.parallel, machine=parallel)
-            wanted = msgspec.structs.replace(wanted, parallel=limits)
-        if profile is not None:
-            defaults = msgspec.structs.replace(wanted.defaults, profile=profile)
-            wanted = msgspec.structs.replace(wanted, defaults=defaults)
-        root = (runs or Path("runs") / wanted.name).absolute()
-        expanded = suite_file.expand(wanted, root, Path.cwd(), tuple(only or ()))
-        kept = cluster.state or root / SWEEP_STATE
-        new = not kept.exists()  # then a dry run keeps none
-        if where.local is not None:
-            chosen = msgspec.structs.replace(where.local, state=None if new and dry_run else kept)
-            where = msgspec.structs.replace(where, local=chosen)
-        patient = not local and (root / INDEX).exists()
-        where = msgspec.structs.replace(where, patient=patient, web=root if web else None)
-        where.check_cases(run.settings for run in expanded)
-        try:
-            code = run_to_end(_suite(wanted, expanded, root, where, changed, dry_run, as_json))
-        except KeyboardInterrupt:
-            fail("interrupted; repeat the command to continue the sweep", 130)
+    if local and (connect or credentials_file):
+        raise ConfigError("--local starts a cluster of its own; it cannot be combined with --connect")
+    where = options.cluster_of(cluster, connect, credentials_file, local=local)
+    wanted = suite_file.read(file)
+    if parallel is not None:
+        limits = msgspec.structs.replace(wanted.parallel, machine=parallel)
+        wanted = msgspec.structs.replace(wanted, parallel=limits)
+    if profile is not None:
+        defaults = msgspec.structs.replace(wanted.defaults, profile=profile)
+        wanted = msgspec.structs.replace(wanted, defaults=defaults)
+    root = (runs or Path("runs") / wanted.name).absolute()
+    expanded = suite_file.expand(wanted, root, Path.cwd(), tuple(only or ()))
+    kept = cluster.state or root / SWEEP_STATE
+    new = not kept.exists()  # then a dry run keeps none
+    if where.local is not None:
+        chosen = msgspec.structs.replace(where.local, state=None if new and dry_run else kept)
+        where = msgspec.structs.replace(where, local=chosen)
+    patient = not local and (root / INDEX).exists()
+    where = msgspec.structs.replace(where, patient=patient, web=root if web else None)
+    where.check_cases(run.settings for run in expanded)
+    try:
+        code = run_to_end(_suite(wanted, expanded, root, where, changed, dry_run, as_json))
+    except KeyboardInterrupt:
+        fail("interrupted; repeat the command to continue the sweep", 130)
     raise typer.Exit(code)
 
 
@@ -165,8 +163,7 @@ async def _suite(
                         view.kept(one.run.name, index.runs.get(one.run.name))
                 sweep = ClaimedSweep(suite, root, index, operations, gateway, view)
                 await unless_failed(asyncio.create_task(sweep.play(decided)), failed)
-    entries = [index.runs[name] for name in names if name in index.runs]
-    entries = [entry for entry in entries if entry.state != "pending"]
+    entries = [entry for entry in map(index.runs.get, names) if entry and entry.state != "pending"]
     if not as_json:
         console.print(results_table(entries))
         if (usage := suite_index.usage_line(index)) is not None:

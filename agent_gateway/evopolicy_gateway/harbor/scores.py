@@ -73,9 +73,8 @@ done
 
 def task_name(folder: RunFolder) -> str:
     """The name of a run's task, from the path of its folder."""
-    root = folder.root
-    words = (root.parent.parent.name, root.parent.name, root.name)
-    return "-".join(filter(None, (_ODD.sub("-", word).strip("-._") for word in words))).lower()
+    words = (_ODD.sub("-", word).strip("-._") for word in folder.root.parts[-3:])
+    return "-".join(filter(None, words)).lower()
 
 
 def _toml(text: str) -> str:
@@ -87,14 +86,10 @@ def task_files(folder: RunFolder, *, env: str, url: str, token: str, agent_s: fl
     """The task's files by path. `url`, `token`: where its verifier gets the score; `agent_s`: the agent's time,
     seconds."""
     name = task_name(folder)
+    # A `$` begins a variable in such a file.
+    source = str(folder.workspace).replace("$", "$$")
     volumes = [
-        {
-            "type": "bind",
-            # A `$` begins a variable in such a file.
-            "source": f"{folder.workspace}{part}".replace("$", "$$"),
-            "target": f"{WORKDIR}{part}",
-            "read_only": part != "",
-        }
+        {"type": "bind", "source": source + part, "target": WORKDIR + part, "read_only": part != ""}
         for part in ("", "/feedback", "/AGENTS.md")
     ]
     bearer = folder.bearer.read_text().strip()
@@ -181,22 +176,25 @@ def _run_of(path: Path) -> RunFolder:
 def make_app(runs: Mapping[str, RunFolder], token: str) -> Starlette:
     """The service of the scores: `POST /TASK`."""
 
-    async def score(request: Request) -> Response:
+    async def answer(request: Request) -> Response:
         given = request.headers.get("authorization", "")
-        if not hmac.compare_digest(given.encode(), f"Bearer {token}".encode()):
-            return PlainTextResponse("wrong or missing token\n", 401)
         folder = runs.get(request.path_params["task"])
-        if folder is None:
-            return PlainTextResponse("no such task\n", 404)
-        try:
-            return _score(folder)
-        except (EvopolicyError, OSError) as error:
-            return PlainTextResponse(f"{error}\n", 409)
+        if not hmac.compare_digest(given.encode(), f"Bearer {token}".encode()):
+            text, status = "wrong or missing token", 401
+        elif folder is None:
+            text, status = "no such task", 404
+        else:
+            try:
+                text, status = _score(folder)
+            except (EvopolicyError, OSError) as error:
+                text, status = str(error), 409
+        return PlainTextResponse(f"{text}\n", status)
 
-    return Starlette(routes=[Route("/{task}", score, methods=["POST"])])
+    return Starlette(routes=[Route("/{task}", answer, methods=["POST"])])
 
 
-def _score(folder: RunFolder) -> Response:
+def _score(folder: RunFolder) -> tuple[str, int]:
+    """Text and status of the answer."""
     if not folder.run_json.exists():
         try:
             finish(folder)
@@ -204,12 +202,11 @@ def _score(folder: RunFolder) -> Response:
             # The run may have ended since: its gateway's files are removed after run.json is written.
             if not folder.run_json.exists():
                 raise
-        return PlainTextResponse("the run is being scored\n", 202)
+        return "the run is being scored", 202
     outcome = read_record(folder.root).outcome
     if outcome.score is None:
-        why = outcome.error or in_words(outcome.status)
-        return PlainTextResponse(f"the run {folder.root} has no score: {why}\n", 409)
-    return PlainTextResponse(f"{outcome.score!r}\n")
+        return f"the run {folder.root} has no score: {outcome.error or in_words(outcome.status)}", 409
+    return repr(outcome.score), 200
 
 
 app = App()
@@ -262,8 +259,6 @@ async def _serve(listener: Listener, runs: list[Path], tasks: Path, agent_s: flo
     if not known:
         raise ConfigError(f"{tasks} has no tasks; name open runs, such as runs/theirs/gym_acrobot/first")
     async with serving(make_app(known, token_of(tasks)), sock) as task:
-        say(
-            f"scores are served at {url}; next, in another terminal: harbor run --path {tasks} --agent AGENT --model"
-            " MODEL"
-        )
+        command = f"harbor run --path {tasks} --agent AGENT --model MODEL"
+        say(f"scores are served at {url}; next, in another terminal: {command}")
         await task

@@ -32,7 +32,6 @@ from evopolicy_common.processes.scratch import remove_tree
 from evopolicy_common.records.open_run import OpenedRun
 from evopolicy_common.records.run_files import read_record
 from evopolicy_common.records.suite_folder import FINISHED, INDEX, PAUSED, Entry, Index
-from evopolicy_common.wire.credentials import Credentials
 from evopolicy_gateway.harnesses.coding_agents import session
 from evopolicy_gateway.processes.child_messages import AgentDoing
 from evopolicy_gateway.run.operations import Operations
@@ -53,18 +52,11 @@ class ClaimedSweep(Sweep):
 
     stays_open = True
 
-    def __init__(
-        self,
-        suite: SuiteFile,
-        root: Path,
-        index: Index,
-        operations: Operations,
-        gateway: Credentials,
-        view: SuiteView,
-    ) -> None:
-        super().__init__(suite.parallel, index, operations, gateway, view)
+    def __init__(self, suite: SuiteFile, root: Path, index: Index, *known: Any) -> None:
+        """`known`: the further arguments of `Sweep`; its view is a `SuiteView`."""
+        super().__init__(suite.parallel, index, *known)
         self._suite = suite
-        self._view = view
+        self._view: SuiteView = known[-1]
         self._root = root.absolute()
         self._host = socket.gethostname()
         # A host is a machine and a folder: two sweeps of one machine in different folders are two hosts.
@@ -74,7 +66,7 @@ class ClaimedSweep(Sweep):
         self._ending: set[str] = set()
         """Cancelled runs that have not ended yet."""
         self._unsaved = False
-        view.on_doing = self._on_doing
+        self._view.on_doing = self._on_doing
 
     async def play(self, decisions: Sequence[Decision]) -> None:
         renewing = asyncio.create_task(self._renew())

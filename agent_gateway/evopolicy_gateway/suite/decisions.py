@@ -153,18 +153,15 @@ def check_changes(decisions: Sequence[Decision], changed: Changed) -> None:
 
 def feedback_bytes(decisions: Sequence[Decision]) -> int:
     """Upper bound for the feedback of the runs to be played, bytes, without videos."""
-    total = 0
-    for one in decisions:
-        env, budget = one.run.settings.env, one.run.settings.budget
-        if one.kind in ("new", "resume", "restart"):
-            total += catalogue.entry(env).feedback_bytes(budget or catalogue.suite_of(env).budget)
-    return total
+    played = [one.run.settings for one in decisions if one.kind in ("new", "resume", "restart")]
+    budgets = [(one.env, one.budget or catalogue.suite_of(one.env).budget) for one in played]
+    return sum(catalogue.entry(env).feedback_bytes(budget) for env, budget in budgets)
 
 
 def lines(decisions: Sequence[Decision], left_alone: Sequence[str]) -> list[str]:
     """The decisions as lines: counts first, then each run that is neither new nor simply kept."""
-    counts = {kind: sum(one.kind == kind for one in decisions) for kind in _WORDS}
-    parts = [f"{n} {_WORDS[kind]}" for kind, n in counts.items() if n]
+    counts = Counter(one.kind for one in decisions)
+    parts = [f"{counts[kind]} {word}" for kind, word in _WORDS.items() if counts[kind]]
     lines = [f"{len(decisions)} runs: {', '.join(parts)}"]
     for one in decisions:
         if one.kind in ("resume", "finish", "restart") or one.why:

@@ -124,7 +124,6 @@ def _above_random(outcome: Outcome) -> Estimate | None:
 
 
 def _against_random(difference: Estimate) -> str:
-    """The difference from random actions as a sentence."""
     if difference.low is None or difference.high is None:
         return f"score − random = {number(difference.value)}, without an interval: {difference.reason}"
     word, least, most = "better", difference.low, difference.high

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import fnmatch
+from collections import Counter
 from collections.abc import Iterable, Iterator
 from importlib import resources
 from pathlib import Path
@@ -138,23 +139,22 @@ def expand(suite: SuiteFile, root: Path, started_in: Path, only: tuple[str, ...]
     Environments come before agents, so that a sweep stopped early compares all agents on some environments, not one
     agent on all. Raises ConfigError for impossible runs.
     """
-    names = [agent.name for agent in suite.agents]
-    doubled = sorted({name for name in names if names.count(name) > 1})
-    if doubled:
+    agents = suite.agents
+    counts = Counter(agent.name for agent in agents)
+    if doubled := sorted(name for name, count in counts.items() if count > 1):
         raise ConfigError(f"several agents are named {', '.join(doubled)}")
-    runs: list[Plan] = []
-    chosen = {
-        agent.name: catalogue.resolve(agent.environments or suite.environments) for agent in suite.agents
-    }
-    everything = list(dict.fromkeys(env for agent in suite.agents for env in chosen[agent.name]))
-    places = [(env, agent) for env in everything for agent in suite.agents if env in chosen[agent.name]]
+    chosen = [(agent, catalogue.resolve(agent.environments or suite.environments)) for agent in agents]
+    everything = dict.fromkeys(env for _, envs in chosen for env in envs)
+    places = [(env, agent) for env in everything for agent, envs in chosen if env in envs]
     tables = [(env, agent, _table(suite, agent, env)) for env, agent in places]
-    for repeat in range(max((table.get("repeats", 1) for _, _, table in tables), default=0)):
-        for env, agent, table in tables:
-            if repeat < table.get("repeats", 1):
-                runs.append(_plan(suite, agent, env, repeat, table, root, started_in))
+    runs = [
+        _plan(suite, agent, env, repeat, table, root, started_in)
+        for repeat in range(max((table.get("repeats", 1) for _, _, table in tables), default=0))
+        for env, agent, table in tables
+        if repeat < table.get("repeats", 1)
+    ]
     if only:
-        runs = [run for run in runs if any(fnmatch.fnmatch(run.name, pattern) for pattern in only)]
+        runs = [run for run in runs if _matches(run.name, only)]
         if not runs:
             raise ConfigError(f"--only {' '.join(only)} matches no run of the suite")
     for run in {run.entry: run for run in runs}.values():
@@ -188,8 +188,8 @@ def _table(suite: SuiteFile, agent: AgentTable, env: str) -> dict[str, Any]:
     fitting = [
         one
         for one in suite.overrides
-        if any(fnmatch.fnmatch(agent.name, glob) for glob in one.agents)
-        and any(fnmatch.fnmatch(env, glob) or env in _resolved(glob) for glob in one.environments)
+        if _matches(agent.name, one.agents)
+        and (_matches(env, one.environments) or any(env in _resolved(name) for name in one.environments))
     ]
     return {
         name: value
@@ -199,6 +199,10 @@ def _table(suite: SuiteFile, agent: AgentTable, env: str) -> dict[str, Any]:
     }
 
 
+def _matches(name: str, globs: Iterable[str]) -> bool:
+    return any(fnmatch.fnmatch(name, glob) for glob in globs)
+
+
 def _resolved(name: str) -> list[str]:
     with contextlib.suppress(ConfigError):
         return list(catalogue.resolve([name]))
@@ -206,32 +210,29 @@ def _resolved(name: str) -> list[str]:
 
 
 def _plan(
-    suite: SuiteFile,
-    agent: AgentTable,
-    env: str,
-    repeat: int,
-    table: dict[str, Any],
-    root: Path,
-    started_in: Path,
+    suite: SuiteFile, agent: AgentTable, env: str, repeat: int, table: dict[str, Any], *folders: Path
 ) -> Plan:
-    if (agent.config is None) == (not agent.agent):
+    """`folders`: the sweep's, and the one in which the command was started."""
+    root, started_in = folders
+    config = agent.config
+    if (config is None) == (not agent.agent):
         raise ConfigError(f"agent {agent.name!r} needs either `agent` or `[agents.config]`")
     given = RunOptions(
-        agent=agent.config.harness if agent.config is not None else agent.agent,
+        agent=agent.agent if config is None else config.harness,
         entry=agent.name,
-        model=agent.config.model if agent.config is not None else None,
+        model=None if config is None else config.model,
         exp_id=f"{suite.name}-{repeat}",
         repeat=repeat,
         runs=root,
         **{name: value for name, value in table.items() if name != "repeats"}
         | {"limits": limits_from(table.get("limits", {}), "limits.")},
     )
-    agent_texts = given.texts(started_in, agent.config)
+    agent_texts = given.texts(started_in, config)
     return given.plan(
         given.settings(env, given.exp_id or "", texts=agent_texts, suite=suite.name),
         started_in,
         name=f"{agent.name}/{env}/{repeat}",
-        config=agent.config,
+        config=config,
         texts=agent_texts,
         parallel=agent.parallel,
         jail=agent.jail,

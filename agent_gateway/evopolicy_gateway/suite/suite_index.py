@@ -63,11 +63,9 @@ def directory_of(run: Plan) -> str:
 
 def entry_of(plan: Plan, record: RunRecord, **more: Any) -> Entry:
     """The index entry of a finished run."""
-    outcome, state, use = record.outcome, state_of(record), record.agent.model_use
-    tokens = None
-    if record.agent.tokens is not None:
-        requests = 0 if use is None else use.requests or 0
-        tokens = msgspec.to_builtins(record.agent.tokens) | {"requests": requests}
+    outcome, state, tokens = record.outcome, state_of(record), record.agent.tokens
+    use = record.agent.model_use
+    requests = {"requests": 0 if use is None else use.requests or 0}
     return msgspec.structs.replace(
         waiting(plan),
         state=state,
@@ -78,7 +76,7 @@ def entry_of(plan: Plan, record: RunRecord, **more: Any) -> Entry:
         n_submits=len(outcome.val_scores or ()),
         budget_used=outcome.budget_used,
         closed_reason=outcome.closed_reason,
-        tokens=tokens,
+        tokens=None if tokens is None else msgspec.to_builtins(tokens) | requests,
         error=outcome.error or (_NO_RUN if state == "error" else None),
         wall_s=record.timing.wall_time_seconds,
         finished_at=record.timing.end_time,
@@ -87,17 +85,13 @@ def entry_of(plan: Plan, record: RunRecord, **more: Any) -> Entry:
 
 
 def waiting(plan: Plan) -> Entry:
-    settings = plan.settings
-    return Entry(
-        name=plan.name, agent=plan.entry, env=settings.env, repeat=settings.repeat, digest=plan.digest
-    )
+    env, repeat = plan.settings.env, plan.settings.repeat
+    return Entry(name=plan.name, agent=plan.entry, env=env, repeat=repeat, digest=plan.digest)
 
 
 def used(index: Index) -> tuple[int, float, int]:
     """Tokens, US dollars and requests of all runs, including earlier attempts."""
-    counts = [
-        one for entry in index.runs.values() for one in (entry.tokens, entry.earlier) if one is not None
-    ]
+    counts = [one for entry in index.runs.values() for one in (entry.tokens, entry.earlier) if one]
     cost = sum(float(one.get("cost") or 0.0) for one in counts)
     return sum(map(tokens_in, counts)), cost, sum(int(one.get("requests") or 0) for one in counts)
 

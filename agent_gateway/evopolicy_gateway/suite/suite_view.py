@@ -145,21 +145,20 @@ class SuiteView(View):
         assert self._console is not None
         table = Table(box=None, pad_edge=False, padding=(0, _GAP, 0, 0))
         # The runs that ended last come first among the ended ones.
-        newest = sorted(
-            self.rows, key=lambda name: getattr(self.rows[name].entry, "finished_at", ""), reverse=True
+        ended = sorted(
+            self.rows.items(), key=lambda one: getattr(one[1].entry, "finished_at", ""), reverse=True
         )
-        names = sorted(newest, key=lambda name: _order(self.rows[name]))
-        longest = max((len(name) for name in names[:_SHOWN_ROWS]), default=0)
-        columns = _columns(self._console.width, longest)
+        rows = sorted(ended, key=lambda one: _order(one[1]))
+        hidden = len(rows) - _SHOWN_ROWS
+        shown = rows[:_SHOWN_ROWS]
+        columns = _columns(self._console.width, max((len(name) for name, _ in shown), default=0))
         for title, width in columns.items():
             # A run's name is never cut: `--only` takes it.
             how: dict[str, Any] = {"overflow": "fold"} if title == "run" else _CUT
             table.add_column(title, width=width, **how)
-        for name in names[:_SHOWN_ROWS]:
-            style = _STYLES[_order(self.rows[name])]
-            cells = dict(zip(_TITLES, (name, *_cells(self.rows[name])), strict=True))
-            table.add_row(*(Text(cells[title], style) for title in columns))
-        hidden = len(names) - _SHOWN_ROWS
+        for name, row in shown:
+            cells = dict(zip(_TITLES, (name, *_cells(row)), strict=True))
+            table.add_row(*(Text(cells[title], _STYLES[_order(row)]) for title in columns))
         more = [Text(f"… and {hidden} more")] if hidden > 0 else []
         return Group(table, *more, Text(self.totals()))
 
@@ -178,14 +177,10 @@ def results_table(entries: list[Entry]) -> Table:
     made = table(*headings, right=("score", "random", "tokens"))
     for entry in entries:
         tokens = tokens_in(entry.tokens)
-        made.add_row(
-            Text(entry.name),
-            in_words(entry.state) + (f" on {entry.host}" if entry.host and not entry.directory else ""),
-            number(entry.score),
-            number(entry.random),
-            str(entry.budget_used),
-            _short(tokens) if tokens else "",
-        )
+        place = f" on {entry.host}" if entry.host and not entry.directory else ""
+        cells = (number(entry.score), number(entry.random), str(entry.budget_used))
+        shown = _short(tokens) if tokens else ""
+        made.add_row(Text(entry.name), in_words(entry.state) + place, *cells, shown)
     return made
 
 

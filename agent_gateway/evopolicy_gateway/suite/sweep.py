@@ -45,11 +45,8 @@ class Sweep(ABC):
     def __init__(
         self, limits: Parallel, index: Index, operations: Operations, gateway: Credentials, watch: View
     ) -> None:
-        self._limits = limits
-        self._index = index
-        self._operations = operations
-        self._gateway = gateway
-        self._watch = watch
+        self._limits, self._index = limits, index
+        self._operations, self._gateway, self._watch = operations, gateway, watch
         self._decided: dict[str, Decision] = {}
         """The latest decision for each run."""
         self._todo: list[Decision] = []
@@ -114,7 +111,6 @@ class Sweep(ABC):
         self._index.runs[entry.name] = entry
 
     def _begun(self, decision: Decision) -> Entry:
-        """The index entry of a starting run."""
         run, now = decision.run, {"state": "running", "attempt": decision.attempt}
         return msgspec.structs.replace(waiting(run), **now, directory=directory_of(run))
 
@@ -141,13 +137,13 @@ class Sweep(ABC):
         starting = [one for one in able if one.kind == "finish"]
         waiting = [one for one in able if one.kind != "finish"]
         while len(placed) < self._limits.machine:
-            fitting = [one for one in side_by_side(waiting, under_way) if self._fits(one.run, placed)]
-            if not fitting:
+            fitting = (one for one in side_by_side(waiting, under_way) if self._fits(one.run, placed))
+            if (chosen := next(fitting, None)) is None:
                 break
-            waiting.remove(fitting[0])
-            starting.append(fitting[0])
-            placed.append(fitting[0].run)
-            under_way.append(fitting[0].run)
+            waiting.remove(chosen)
+            starting.append(chosen)
+            for runs in (placed, under_way):
+                runs.append(chosen.run)
         return starting
 
     def _fits(self, run: Plan, placed: list[Plan]) -> bool:
@@ -189,13 +185,8 @@ class Sweep(ABC):
     async def _played(
         self, decision: Decision, plan: Plan, put_aside: Callable[[], None] | None = None
     ) -> RunRecord:
-        play = RunLifecycle(
-            plan,
-            self._operations,
-            self._gateway,
-            self._watch,
-            stays_open=self.stays_open,
-            on_agent_gone=partial(self._agent_gone, plan.name),
-        )
+        known = (plan, self._operations, self._gateway, self._watch)
+        gone = partial(self._agent_gone, plan.name)
+        play = RunLifecycle(*known, stays_open=self.stays_open, on_agent_gone=gone)
         self._plays[plan.name] = play
         return await (play.go_on() if decision.kind in ("resume", "finish") else play.play(put_aside))

@@ -153,7 +153,7 @@ class Stage:
             self.suite,
             self.root,
             self.index,
-            self.cluster,  # type: ignore[arg-type]
+            self.cluster,
             Credentials(
                 role="gateway", endpoints=("tcp/h:1",), cluster="c", user="u", password="p", token="t"
             ),

@@ -1,4 +1,4 @@
-"""What is told of finished runs: the index's bytes, the documents of `--json`, the exit code with its reasons, the
+"""Accounts of finished runs: the index's bytes, the documents of `--json`, the exit code with its reasons, the
 report."""
 
 from __future__ import annotations

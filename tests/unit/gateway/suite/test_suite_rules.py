@@ -181,7 +181,7 @@ def test_a_file_that_contradicts_its_profile_is_refused(tmp_path: Path) -> None:
         suite_in(tmp_path, text)
 
 
-def test_what_becomes_of_each_run(tmp_path: Path) -> None:
+def test_the_facts_about_a_run_decide_its_start(tmp_path: Path) -> None:
     run = suite_in(tmp_path)[0]
     running = entry_of(run, state="running")
     cases = [
@@ -202,19 +202,19 @@ def test_what_becomes_of_each_run(tmp_path: Path) -> None:
         (Facts(entry=running), "restart", 2),
         (Facts(entry=running, intended=True), "resume", 1),
     ]
-    for found, kind, attempt in cases:
-        decision = decide(run, found)
-        assert (decision.kind, decision.attempt) == (kind, attempt), found
+    for facts, kind, attempt in cases:
+        decision = decide(run, facts)
+        assert (decision.kind, decision.attempt) == (kind, attempt), facts
 
 
 def test_a_changed_file_is_the_operators_decision(tmp_path: Path) -> None:
     run = suite_in(tmp_path)[0]
-    found = Facts(status="completed", entry=entry_of(run, state="completed", digest="another"))
-    refused = [decide(run, found, "refuse")]
+    facts = Facts(status="completed", entry=entry_of(run, state="completed", digest="another"))
+    refused = [decide(run, facts, "refuse")]
     with pytest.raises(ConfigError, match="evolve/toy/line/0 was played: give --changed keep"):
         check_changes(refused, "refuse")
-    assert decide(run, found, "keep").kind == "keep"
-    again = decide(run, found, "rerun")
+    assert decide(run, facts, "keep").kind == "keep"
+    again = decide(run, facts, "rerun")
     assert (again.kind, again.attempt) == ("restart", 2)
     check_changes([again], "rerun")
     shown = lines([again], ["gone/toy/line/0"])
@@ -234,7 +234,7 @@ def test_only_what_is_played_takes_room_for_feedback(tmp_path: Path) -> None:
     assert feedback_bytes([Decision(run=usual, kind="resume", attempt=1)]) == 128 * episode
 
 
-def test_what_has_changed_in_the_file_is_named(tmp_path: Path) -> None:
+def test_changed_settings_of_the_file_are_named(tmp_path: Path) -> None:
     before = {run.name: run for run in suite_in(tmp_path)}
     text = FILE.replace("budget = 16", "budget = 32\nvalidation = 4\nlimits = { act_wall_s = 2.0 }")
     text = text.replace('"gpt-5.5"', '"gpt-6"\neffort = "high"').replace(
@@ -327,7 +327,7 @@ def test_the_live_table_shows_each_run_and_the_totals(tmp_path: Path) -> None:
     assert "$ curl /submit" in text
     assert "score -1.25" in text
     assert "2 of 7 runs done, 1 running, 1 failed, 1.5k tokens, about 2 min left" in text
-    # What goes on, what failed, what waits, and what ended: the last first.
+    # Running, failed, waiting and ended runs: of these the last first.
     rows = [line for line in text.splitlines() if line.startswith(("evolve/", "GPT/")) and ":" not in line]
     names = [line.split()[0] for line in rows]
     assert names == [second.name, failed.name, *(run.name for run in runs[4:]), third.name, first.name]

@@ -146,7 +146,7 @@ def test_a_sweeps_cap_begins_no_further_run(staged: Staged, cap: str) -> None:
     assert "2 runs are left as they are" in stage.events[-1]
 
 
-def test_what_an_earlier_attempt_used_counts_towards_the_cap(staged: Staged) -> None:
+def test_use_of_an_earlier_attempt_counts_towards_the_cap(staged: Staged) -> None:
     text = "[caps]\nmax_cost = 0.7\n" + CODEX.format("a") + CODEX.format("b")
     stage = staged(text)
     a, b = stage.runs

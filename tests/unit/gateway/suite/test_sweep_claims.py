@@ -71,8 +71,8 @@ def test_a_claim_lost_to_another_host_ends_the_run_here(staged: Staged) -> None:
     entry = index.runs[run.name]
     assert (entry.state, entry.score, entry.host, entry.directory) == ("completed", 3.0, "other", "")
     # Started again, with the folder of the run that was ended here still open: nothing is left to do.
-    found = Facts(entry=entry, opened=True, phase="finished")
-    assert decide(run, found) == Decision(run=run, kind="keep", attempt=1)
+    facts = Facts(entry=entry, opened=True, phase="finished")
+    assert decide(run, facts) == Decision(run=run, kind="keep", attempt=1)
 
 
 def test_a_finished_run_that_another_host_took_meanwhile_is_not_written_here(
