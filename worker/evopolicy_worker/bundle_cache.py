@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import shutil
-from collections import OrderedDict
+from collections import Counter, OrderedDict
 from collections.abc import AsyncIterator, Awaitable, Callable
 from pathlib import Path
 
@@ -21,7 +21,7 @@ class BundleCache:
         self._fetch = fetch
         self._limit = limit
         self._ready: OrderedDict[str, asyncio.Task[Path]] = OrderedDict()
-        self._users: dict[str, int] = {}
+        self._users: Counter[str] = Counter()
 
     @property
     def warm(self) -> tuple[str, ...]:
@@ -36,21 +36,17 @@ class BundleCache:
         if task is None:
             task = self._ready[digest] = asyncio.create_task(self._bring(digest))
         self._ready.move_to_end(digest)
-        self._users[digest] = self._users.get(digest, 0) + 1
+        self._users[digest] += 1
         try:
             try:
                 # Shielded: another job with the same bundle may wait for the same fetch.
                 folder = await asyncio.shield(task)
-            except asyncio.CancelledError:
-                raise
             except Exception:
                 self._ready.pop(digest, None)
                 raise
             yield folder
         finally:
-            self._users[digest] -= 1
-            if not self._users[digest]:
-                del self._users[digest]
+            self._users -= Counter((digest,))
             await self._evict()
 
     async def _bring(self, digest: str) -> Path:

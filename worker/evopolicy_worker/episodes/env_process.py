@@ -24,18 +24,15 @@ from evopolicy_common.errors import (
     EvopolicyError,
     SandboxError,
     SlotDiedError,
-    WorkerError,
 )
 from evopolicy_worker import environments
 from evopolicy_worker.environments.interface import calls
 from evopolicy_worker.episodes.loop import Player, fault_of
 from evopolicy_worker.episodes.monitor import Monitor
-from evopolicy_worker.episodes.policy_process import BundleFiles
-from evopolicy_worker.episodes.progress import CancelledJobError, Progress
+from evopolicy_worker.episodes.policies import CancelledJobError, Progress
 from evopolicy_worker.sandbox import env_jail, jail
 from evopolicy_worker.sandbox.zygote import Zygote
 from evopolicy_worker.slot_protocol import slot_messages as messages
-from evopolicy_worker.slot_protocol.child_pipes import take_pipes
 
 _PROGRESS_S = 0.25
 ALIVE_S = 5.0
@@ -57,15 +54,7 @@ class Channel:
         if not data:
             os._exit(0)
         self._received += data
-        found: list[messages.Command] = []
-        size = messages.LENGTH.size
-        while len(self._received) >= size:
-            (length,) = messages.LENGTH.unpack_from(self._received)
-            if len(self._received) < size + length:
-                break
-            found.append(messages.commands.decode(bytes(self._received[size : size + length])))
-            del self._received[: size + length]
-        return found
+        return [messages.commands.decode(each) for each in messages.unframed(self._received)]
 
     def send(self, message: messages.Message) -> None:
         self.send_frame(messages.framed(message))
@@ -80,16 +69,14 @@ class Channel:
 class EnvProcess:
     """One slot's life: start, then job after job."""
 
-    def __init__(self, channel: Channel, commands: int) -> None:
+    def __init__(self, channel: Channel, commands: int, limits: calls.Limits) -> None:
         self._channel = channel
-        self._jobs: queue.SimpleQueue[tuple[messages.Play, Progress] | messages.Describe] = (
-            queue.SimpleQueue()
-        )
-        self._bundle: tuple[str, BundleFiles] | None = None
+        self._jobs = queue.SimpleQueue[tuple[messages.Play, Progress] | messages.Describe]()
+        self._bundle: messages.Files | None = None
         self._progress: Progress | None = None
         self._last_report = (0.0, 0)
-        self._limits = calls.Limits()
-        self._guard = calls.Guard(self._limits)
+        self._limits = limits
+        self._guard = calls.Guard(limits)
         self._monitor = Monitor(commands, self._hear, self._tell)
 
     def run(self, start: messages.Start, early: list[messages.Command]) -> None:
@@ -100,8 +87,6 @@ class EnvProcess:
         # Without its parents: a worker that has gone meanwhile has taken them with it.
         scratch.mkdir(exist_ok=True)
         environments.define(start.definitions)
-        self._limits = start.limits
-        self._guard = calls.Guard(start.limits)
         env_jail.enclose(start.tier, scratch, draws=start.draws)
         plan = jail.plan(start.tier, scratch, start.allowed_packages, sealed=start.sealed, user=start.user)
         with env_jail.expendable():
@@ -114,10 +99,9 @@ class EnvProcess:
         faulthandler.enable(all_threads=False)  # so that a crash names the environment's lines
         calls.current.process = os.getpid()
         player = Player(zygote, plan, self._monitor, scratch)
-        for command in early:
-            self._take(command)
+        self._hear(early)
         self._monitor.start()
-        player.prepare()
+        player.policies.prepare()
         self._channel.send(messages.Ready())
         while True:
             work = self._jobs.get()
@@ -127,25 +111,21 @@ class EnvProcess:
             self._channel.send_frame(self._play(player, *work))
             # A sandbox that has ended meanwhile is the next job's to find.
             with contextlib.suppress(SandboxError, SlotDiedError):
-                player.prepare()
+                player.policies.prepare()
 
     def _play(self, player: Player, command: messages.Play, progress: Progress) -> bytes:
         """Plays a job and returns its last frames, which wake the supervisor only once."""
         try:
-            files = self._files(command.bundle)
-            last = player.play(
-                command.job, files, progress, self._channel.send_frame, command.first, command.failure
-            )
+            self._bundle = command.bundle or self._bundle
+            options = (progress, self._channel.send_frame, command.first, command.failure)
+            last = player.play(command.job, self._bundle, *options)
             progress.give_up(None)
             return last + messages.framed(messages.Played())
-        except CancelledJobError:
-            progress.give_up(self._channel.send)
-            return messages.framed(messages.Played(cancelled=True))
         except BaseException as error:  # such as an environment's sys.exit
             progress.give_up(self._channel.send)
-            # With a cancellation: whatever it met on its way out.
-            answer = messages.Played(cancelled=True) if progress.cancelled else self._fault(error)
-            return messages.framed(answer)
+            # A cancelled job may meet any other error on its way out.
+            cancelled = progress.cancelled or isinstance(error, CancelledJobError)
+            return messages.framed(messages.Played(cancelled=True) if cancelled else self._fault(error))
         finally:
             self._progress = None
             self._monitor.ticking = False
@@ -163,37 +143,24 @@ class EnvProcess:
     def _fault(self, error: BaseException) -> messages.Fault:
         text = calls.raised(error, fault_of(error), self._limits)
         calls.current.what = ""
-        if text or isinstance(error, BrokenEnvironmentError):
-            return messages.Fault(kind="environment", message=text or fault_of(error))
         kind = "sandbox" if isinstance(error, SandboxError | SlotDiedError) else "worker"
-        return messages.Fault(kind=kind, message=fault_of(error))
+        if text or isinstance(error, BrokenEnvironmentError):
+            kind = "environment"
+        return messages.Fault(kind=kind, message=text or fault_of(error))
 
-    def _files(self, bundle: messages.Files | None) -> BundleFiles | None:
-        if bundle is None:
-            return None
-        if bundle.names is not None:
-            self._bundle = bundle.key, BundleFiles(bundle.names, bundle.data)
-        if self._bundle is None or self._bundle[0] != bundle.key:
-            raise WorkerError("a job came without its bundle's files")
-        return self._bundle[1]
-
-    def _hear(self) -> None:
-        for command in self._channel.receive():
-            self._take(command)
-
-    def _take(self, command: messages.Command) -> None:
-        if isinstance(command, messages.Describe):
-            self._jobs.put(command)
-        elif isinstance(command, messages.Play):
-            # From now on it can be cancelled, also before it is taken up.
-            self._last_report = 0.0, 0
-            self._progress = Progress()
-            # This is the monitor's own thread, which need not be woken for it.
-            self._monitor.ticking = True
-            self._jobs.put((command, self._progress))
-        elif isinstance(command, messages.Cancel):
-            progress = self._progress
-            if progress is not None:
+    def _hear(self, commands: list[messages.Command] | None = None) -> None:
+        """Takes these commands, or those that arrive."""
+        for command in self._channel.receive() if commands is None else commands:
+            if isinstance(command, messages.Describe):
+                self._jobs.put(command)
+            elif isinstance(command, messages.Play):
+                # From now on it can be cancelled, also before it is taken up.
+                self._last_report = 0.0, 0
+                self._progress = Progress()
+                # This is the monitor's own thread, which need not be woken for it.
+                self._monitor.ticking = True
+                self._jobs.put((command, self._progress))
+            elif isinstance(command, messages.Cancel) and (progress := self._progress) is not None:
                 progress.cancel()
                 # Now: a simulator may take long over its step, and is ended then.
                 progress.give_up(self._channel.send)
@@ -216,16 +183,15 @@ class EnvProcess:
 
 def main() -> None:
     """The process's entry."""
-    commands, replies = take_pipes()
+    commands, replies = messages.take_pipes()
     channel = Channel(commands, replies)
-    received: list[messages.Command] = []
-    while not received:
-        received = channel.receive()
+    while not (received := channel.receive()):
+        pass
     start, *early = received
     if not isinstance(start, messages.Start):
         sys.exit(f"the first command is {type(start).__name__}, not Start")
     try:
-        EnvProcess(channel, commands).run(start, early)
+        EnvProcess(channel, commands, start.limits).run(start, early)
     except EvopolicyError as error:
         kind = "sandbox" if isinstance(error, SandboxError) else "worker"
         channel.send(messages.Fault(kind=kind, message=str(error)))

@@ -8,7 +8,6 @@ parsed as plain values and arrays, and never executed; any other bytes raise Bad
 from __future__ import annotations
 
 import datetime
-import json
 import math
 import struct
 from collections.abc import Callable, Iterable, Iterator
@@ -27,12 +26,10 @@ from evopolicy_worker.sandbox.inside.player import (
     FLOAT,
     FLOATS,
     GENERIC,
-    INIT,
     INT,
     MAX_AXES,
     MAX_USED,
     NONE,
-    REQUEST_HEADER,
     numbers_of,
 )
 
@@ -148,7 +145,7 @@ def _graph_step(value: Any, out: list[Any]) -> None:
 
 def _step(space: SpaceSchema, *, padded: bool = False) -> Step:
     """`padded`: in the fixed part, where arrays end on a multiple of 8 bytes. In a value whose form the space leaves
-    open, counts stand before what they count."""
+    open, counts stand before the parts that they count."""
     kind = space["type"]
     if kind == "Text":
         return _text_step
@@ -196,13 +193,6 @@ def elements(space: SpaceSchema) -> int:
     return int(space["max_length"]) if space["type"] == "Text" else math.prod(array_of(space)[0])
 
 
-def init_frame(init: dict[str, Any], files: bytes) -> list[bytes]:
-    """The first request: the settings of the policy's process, and its bundle."""
-    head = json.dumps(init).encode()
-    length = len(head) + len(files)
-    return [REQUEST_HEADER.pack(length, INIT, len(head)), head, files]
-
-
 def action(tag: int, payload: bytes, max_values: int = 1024) -> Any:
     """The value that `act` returned. Raises BadReplyError if the bytes encode no value; its validity is not checked
     here.
@@ -210,28 +200,28 @@ def action(tag: int, payload: bytes, max_values: int = 1024) -> Any:
     `max_values`: how many numbers, texts, lists and dicts, with what is in them, it may be made of; of arrays the
     numbers count, or the innermost lists where there are none.
     """
+    value: Any
     try:
-        if tag == ARRAY:
-            array = _array(payload)
-            if array.size > max_values or (not array.size and numbers_of(array) > max_values):
-                raise ValueError(f"it holds {numbers_of(array):,} values; {max_values:,} are the limit")
-            return array
         if tag == INT:
             return _INT.unpack(payload)[0]
-        if tag == FLOATS:
-            if len(payload) > 8 * max_values:
-                raise ValueError(f"it holds {len(payload) // 8:,} values; {max_values:,} are the limit")
-            return list(struct.unpack(f"<{len(payload) // 8}d", payload))
         if tag == FLOAT:
             return _FLOAT.unpack(payload)[0]
-        if tag == GENERIC:
+        if tag == ARRAY:
+            value = _array(payload)
+            n = value.size or numbers_of(value)
+        elif tag == FLOATS:
+            n = len(payload) // 8
+            value = list(struct.unpack(f"<{n}d", payload))
+        elif tag == GENERIC:
             value = _decoder.decode(payload)
-            if (n := _values(value, MAX_DEPTH)) > max_values:
-                raise ValueError(f"it holds {n:,} values; {max_values:,} are the limit")
-            return value
+            n = _values(value, MAX_DEPTH)
+        else:
+            raise BadReplyError(f"it answered with frame {tag}, which is no action")
+        if n > max_values:
+            raise ValueError(f"it holds {n:,} values; {max_values:,} are the limit")
     except (struct.error, msgspec.DecodeError, ValueError, TypeError, RecursionError, OverflowError) as error:
         raise BadReplyError(f"its action cannot be read: {error}") from error
-    raise BadReplyError(f"it answered with frame {tag}, which is no action")
+    return value
 
 
 def report(payload: bytes) -> Report:

@@ -44,7 +44,7 @@ from evopolicy_common.errors import (
     WorkerError,
 )
 from evopolicy_common.messages.bounds import LARGEST
-from evopolicy_common.messages.environment import Case, EnvironmentDescription
+from evopolicy_common.messages.environment import EnvironmentDescription
 from evopolicy_common.messages.episode import (
     LARGEST_LIMITS,
     NO_POLICY,
@@ -65,12 +65,11 @@ from evopolicy_worker.environments.interface.actions import ActionCodec
 from evopolicy_worker.environments.interface.base import Observation, Step
 from evopolicy_worker.environments.interface.calls import described, note
 from evopolicy_worker.environments.interface.trial import solved
-from evopolicy_worker.episodes import float_environment
 from evopolicy_worker.episodes.monitor import Monitor
-from evopolicy_worker.episodes.policies import JobPolicies, Policies
-from evopolicy_worker.episodes.policy_process import BundleFiles, PolicyFailedError, PolicyProcess
-from evopolicy_worker.episodes.progress import CancelledJobError, Progress
-from evopolicy_worker.episodes.recording import VideoRecorder
+from evopolicy_worker.episodes.policies import CancelledJobError, Policies, Progress
+from evopolicy_worker.episodes.policy_process import PolicyFailedError, PolicyProcess
+from evopolicy_worker.episodes.video import VideoRecorder
+from evopolicy_worker.sandbox.inside.player import reset_floats
 from evopolicy_worker.sandbox.jail import Jail
 from evopolicy_worker.sandbox.zygote import Zygote
 from evopolicy_worker.slot_protocol import endings
@@ -95,15 +94,13 @@ Source = Callable[[int, Observation], tuple[Any, Any, str]]
 """From a step's index and observation to the action as returned, as repaired, and its mark or ""."""
 _ACTING = messages.framed(messages.Acting())
 _Tell = Callable[[bytes], None]
-_Film = tuple[int, Case, bytes, int]
-"""A video to make: the episode's index in the job, case, actions and length."""
 
 
 class Player:
     """Plays jobs one after another with warm environments and a zygote."""
 
     def __init__(self, zygote: Zygote, jail: Jail, monitor: Monitor, scratch: Path) -> None:
-        self._policies = Policies(zygote, jail, monitor, scratch)
+        self.policies = Policies(zygote, jail, monitor, scratch)
         self._environments: OrderedDict[str, Environment] = OrderedDict()
         self._videos = VideoRecorder()
         self._log = Log(scratch)
@@ -111,7 +108,7 @@ class Player:
     def play(
         self,
         job: Job,
-        files: BundleFiles | None,
+        files: messages.Files | None,
         progress: Progress,
         tell: _Tell,
         first: int = 0,
@@ -127,10 +124,11 @@ class Player:
         job = msgspec.structs.replace(job, limits=_within_share(job))
         if job.bundle is not None and files is None:
             raise WorkerError("a job with a bundle came without the bundle")
-        policies = JobPolicies(self._policies, job, files, environment)
+        self.policies.begin_job(job, files, environment, progress)
         before = unpack(job)
         frame = b""
-        films: list[_Film] = []
+        films: list[tuple[int, bytes, int]] = []
+        """Videos to make: the episode's index in the job, its actions and length."""
         try:
             progress.episodes_done = first
             for k in range(first, len(job.episodes)):
@@ -140,17 +138,20 @@ class Player:
                     raise CancelledJobError
                 begun = before[k].unpacked() if failure is None and k in before else Begun(failure=failure)
                 if is_kept(job):
-                    progress.begins(k, begun)
+                    progress.begun = k, begun
                 if job.bundle is not None:
                     self._log.begins(job.job_id, k, begun)
-                failure, frame, film_of = self._play(k, job, policies, progress, tell, begun)
-                films += film_of
+                outcome, frame, log = self._play(k, job, progress, tell, begun)
+                if log and job.video and (not job.video_episodes or k < job.video_episodes):
+                    films.append((k, log, outcome.length))
                 progress.episodes_done += 1
+                failure = outcome.failure
                 if failure is not None and _verdict_of_submit(job, job.episodes[k], failure):
-                    none: dict[str, Any] = {"length": 0, "terminated": False, "truncated": False}
+                    none = msgspec.structs.replace(
+                        outcome, stdout=b"", stderr=b"", wall_s=0.0, policy_cpu_s=0.0
+                    )
                     others = (
-                        EpisodeOutcome(index=each.index, episode_return=0.0, **none, failure=failure)
-                        for each in job.episodes[k + 1 :]
+                        msgspec.structs.replace(none, index=each.index) for each in job.episodes[k + 1 :]
                     )
                     finished = (messages.Finished(outcome=_brief(each, _share(job))) for each in others)
                     # Joined once: there may be thousands, each with a traceback.
@@ -158,48 +159,42 @@ class Player:
                     break
                 failure = None
         finally:
-            policies.close(progress)
+            progress.policy = None
+            self.policies.drop()
         if not job.video:
             self._videos.close()
-        for film in films:
+        for k, log, length in films:
             if frame:
                 tell(frame)
-            frame = self._filmed(job.env, film, progress)
+            case, description = job.episodes[k].case, self._environment(job.env).description
+            mp4 = self._videos.record(description, case, log, length, lambda: progress.cancelled)
+            if progress.cancelled:
+                raise CancelledJobError
+            frame = b"" if mp4 is None else messages.framed(messages.Filmed(place=k, video=_blob(mp4)))
         return frame
 
-    def _filmed(self, env: str, film: _Film, progress: Progress) -> bytes:
-        """A framed `Filmed`; nothing where there can be no video."""
-        k, case, actions, length = film
-        description = self._environment(env).description
-        mp4 = self._videos.record(description, case, actions, length, lambda: progress.cancelled)
-        if progress.cancelled:
-            raise CancelledJobError
-        return b"" if mp4 is None else messages.framed(messages.Filmed(place=k, video=_blob(mp4)))
-
     def _play(
-        self, k: int, job: Job, policies: JobPolicies, progress: Progress, tell: _Tell, begun: Begun
-    ) -> tuple[PolicyFailure | None, bytes, list[_Film]]:
-        """The failure in one episode, which continues from `begun`, its framed outcome, and the video to make."""
+        self, k: int, job: Job, progress: Progress, tell: _Tell, begun: Begun
+    ) -> tuple[EpisodeOutcome, bytes, bytes]:
+        """The outcome of one episode, which continues from `begun`, the same framed, and the log of its actions."""
         n_ends = 0
         while True:
             environment = self._environment(job.env)
-            episode = _Episode(job, k, environment, policies, progress, tell, begun)
+            episode = _Episode(job, k, job.episodes[k], environment, self.policies, progress, tell, begun)
             try:
                 outcome, log, unused = episode.play()
                 # In every split, as a policy of several episodes can measure the pause between them.
                 packed = begun.packed() if job.bundle is not None and len(job.episodes) > 1 else None
                 kept = packed if is_kept(job) else None
                 finished = messages.Finished(outcome=_brief(outcome, _share(job)), begun=kept, unused=unused)
-                films = log and job.video and (not job.video_episodes or k < job.video_episodes)
-                film = [(k, job.episodes[k].case, log, outcome.length)] if films else []
-                return outcome.failure, messages.framed(finished), film
+                return outcome, messages.framed(finished), log
             except EndedFromOutsideError as error:
                 # Where one policy plays several episodes it took with it what it had learned.
                 n_ends += 1
                 if progress.cancelled or job.policy_scope == "submit" or n_ends > MAX_ENDS:
                     raise
                 note(f"a policy is started again: {fault_of(error)}")
-                policies.drop()
+                self.policies.drop()
             except (CancelledJobError, SandboxError, SlotDiedError, OSError, MemoryError):
                 raise
             except BaseException as error:  # such as an environment's sys.exit
@@ -211,18 +206,6 @@ class Player:
                 begun.fail(begun.failure or endings.BROKE_DOWN)
                 with contextlib.suppress(BaseException):  # of what broke down
                     self._environments.pop(job.env).close()
-
-    def prepare(self) -> None:
-        """Buries the last policy and forks the process for the next; to be called while there is nothing else to do."""
-        self._policies.prepare()
-
-    def close(self) -> None:
-        for environment in self._environments.values():
-            environment.close()
-        self._environments.clear()
-        self._videos.close()
-        self._policies.close()
-        self._log.close()
 
     def describe(self, env_id: str) -> EnvironmentDescription:
         """An environment's description. The environment is created for it and kept for later jobs. Raises WorkerError
@@ -248,8 +231,9 @@ class _Episode:
     job: Job
     k: int
     """The episode's index in the job."""
+    spec: EpisodeSpec
     environment: Environment
-    policies: JobPolicies
+    policies: Policies
     progress: Progress
     tell: _Tell
     begun: Begun
@@ -257,15 +241,15 @@ class _Episode:
     acted: bool = False
     """Whether an action of the policy's has reached the environment."""
 
-    @property
-    def spec(self) -> EpisodeSpec:
-        return self.job.episodes[self.k]
-
     def play(self) -> tuple[EpisodeOutcome, bytes, bytes]:
         """The outcome, without a video, the log of actions if it was kept, and feedback that nobody may read."""
         job, spec, begun = self.job, self.spec, self.begun
         start = time.monotonic()
-        recorded = _recorded_actions(spec)
+        recorded: list[Returned] | None = None
+        if spec.replay is not None:
+            if spec.replay.inline is None:
+                raise WorkerError(f"episode {spec.index} came without the recording that it plays")
+            recorded = [Returned(row.action, row.action) for row in decode(spec.replay.inline).rows()]
         course = _Course(job, self.environment, recorded)
         policy = self._begin() if job.bundle is not None and begun.failure is None else None
         unplayed = begun.failure is not None and _verdict_of_submit(job, spec, begun.failure)
@@ -307,9 +291,8 @@ class _Episode:
     def _begin(self) -> PolicyProcess | None:
         """The policy, told of the new episode; None, with the failure noted, when it failed before its first act."""
         try:
-            policy = self.policies.take(self.k, self.spec, self.progress)
+            policy = self.policies.take(self.k, self.spec)
             policy.reset(self.spec.episode_index)
-            policy.prepare_acts()
             return policy
         except PolicyFailedError as error:
             self._note(error.failure)
@@ -327,13 +310,15 @@ class _Episode:
             return _asked(codec, policy, begun)
         if recorded is not None:
             return _replayed(codec, recorded)
-        mark = FAILED if self.job.bundle is not None else ""
-        return _replayed(codec, begun.taken, _random(codec, self.spec.policy_seed, mark))
+        mark, rng = FAILED if self.job.bundle is not None else "", random_actions(self.spec.policy_seed)
+        return _replayed(codec, begun.taken, lambda t, obs: (action := codec.sample(rng), action, mark))
 
     def _steps(self, source: Source, course: _Course) -> None:
         """Plays from reset to the end."""
         progress, taken, step, add = self.progress, self.begun.taken, self.environment.step, course.add
-        float_environment.reset()
+        # A library that was compiled for speed may change rounding for the whole process when it is loaded, and an
+        # episode must not depend on those that were played before it.
+        reset_floats()
         obs = self.environment.reset(self.spec.case)
         for t in itertools.count():
             try:
@@ -408,12 +393,6 @@ class _Course:
         return terminated or truncated or length == self._n_recorded or mark == self._last_mark
 
 
-def _random(codec: ActionCodec, policy_seed: bytes, mark: str) -> Source:
-    """Uniform random actions with this mark."""
-    rng = random_actions(policy_seed)
-    return lambda t, obs: (action := codec.sample(rng), action, mark)
-
-
 def _replayed(codec: ActionCodec, actions: Sequence[Returned], then: Source | None = None) -> Source:
     """Actions of an earlier attempt or a recording; after the last, those of `then`."""
 
@@ -446,15 +425,6 @@ def random_actions(policy_seed: bytes) -> np.random.Generator:
     """The generator of the uniform random actions that play in place of a policy."""
     digest = hashlib.sha256(b"evopolicy random actions\0" + policy_seed).digest()
     return np.random.default_rng(int.from_bytes(digest, "little"))
-
-
-def _recorded_actions(spec: EpisodeSpec) -> list[Returned] | None:
-    """The actions that are played again; None where a policy acts."""
-    if spec.replay is None:
-        return None
-    if spec.replay.inline is None:
-        raise WorkerError(f"episode {spec.index} came without the recording that it plays")
-    return [Returned(row.action, row.action) for row in decode(spec.replay.inline).rows()]
 
 
 def _verdict_of_submit(job: Job, spec: EpisodeSpec, failure: PolicyFailure) -> bool:

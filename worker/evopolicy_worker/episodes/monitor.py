@@ -11,6 +11,7 @@ Rules:
 
 from __future__ import annotations
 
+import contextlib
 import os
 import select
 import sys
@@ -50,23 +51,23 @@ class Verdict(NamedTuple):
 class Output:
     """Keeps the first `limit` bytes of a stream; reads and drops all others."""
 
-    def __init__(self, limit: int) -> None:
+    def __init__(self, fd: int, limit: int) -> None:
+        os.set_blocking(fd, False)
+        self.fd = fd
         self._limit = limit
         self._kept = bytearray()
         self.open = True
         """False once the policy has closed the stream."""
 
-    def drain(self, fd: int) -> None:
+    def drain(self) -> None:
         """Reads available output without waiting."""
-        for _ in range(64):
-            if not self.open:
-                return
-            try:
-                data = os.read(fd, _PIECE)
-            except BlockingIOError:
-                return
-            self.open = bool(data)
-            self._kept += data[: self._limit - len(self._kept)]
+        with contextlib.suppress(BlockingIOError):
+            for _ in range(64):
+                if not self.open:
+                    break
+                data = os.read(self.fd, _PIECE)
+                self.open = bool(data)
+                self._kept += data[: self._limit - len(self._kept)]
 
     def take(self) -> bytes:
         """Returns the stored output and clears it."""
@@ -83,8 +84,8 @@ class Watch:
         """`held`: whether only others can stop it."""
         self.child = child
         self.limits = limits
-        self.stdout = Output(limits.output_bytes)
-        self.stderr = Output(limits.output_bytes)
+        self.stdout = Output(child.stdout, limits.output_bytes)
+        self.stderr = Output(child.stderr, limits.output_bytes)
         self.since = 0.0
         """Since when (monotonic) the policy owes an answer; 0.0 while it owes none."""
         self.what = ""
@@ -108,8 +109,6 @@ class Watch:
         self._stood_s = self._waiting_s = self._cpu_s = 0.0
         self._cpu_clock = proc.clock(child.host_pid) if child.host_pid else 0
         self._count_threads = count_threads
-        for fd in (child.stdout, child.stderr):
-            os.set_blocking(fd, False)
 
     def begin_episode(self) -> None:
         """Wall and CPU time count from here."""
@@ -125,9 +124,9 @@ class Watch:
             return 0.0
 
     def drain(self) -> None:
-        """Take in what the policy has printed, so that it never waits for us."""
-        self.stdout.drain(self.child.stdout)
-        self.stderr.drain(self.child.stderr)
+        """Reads the policy's output, so that it never waits for us."""
+        self.stdout.drain()
+        self.stderr.drain()
 
     def judge(self, now: float) -> float:
         """Ends the policy if it passed a limit; seconds until it is worth checking again."""
@@ -270,10 +269,9 @@ class Monitor(threading.Thread):
             poller.register(self._commands, select.POLLIN)
             poller.register(self._wake, select.POLLIN)
             busy = watch is not None or self.ticking
-            if watch is not None:
-                for output, fd in ((watch.stdout, watch.child.stdout), (watch.stderr, watch.child.stderr)):
-                    if output.open:
-                        poller.register(fd, select.POLLIN)
+            for output in (watch.stdout, watch.stderr) if watch is not None else ():
+                if output.open:
+                    poller.register(output.fd, select.POLLIN)
             ready = {fd for fd, _ in poller.poll(pause_s * 1000 if busy else None)}
             if self._wake in ready:
                 os.eventfd_read(self._wake)

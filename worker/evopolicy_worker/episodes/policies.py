@@ -8,25 +8,27 @@ Rules:
 from __future__ import annotations
 
 import contextlib
+import itertools
+import threading
 import time
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 from evopolicy_common.errors import EvopolicyError
-from evopolicy_common.messages.episode import EpisodeSpec, Job, PolicyFailure, ResourceLimits
+from evopolicy_common.messages.episode import EpisodeSpec, Job, PolicyFailure
 from evopolicy_common.processes.scratch import remove_tree
 from evopolicy_worker.environments import Environment
 from evopolicy_worker.episodes.monitor import Monitor
 from evopolicy_worker.episodes.policy_process import (
-    BundleFiles,
     Ended,
     PolicyFailedError,
     PolicyProcess,
     oom_kills,
 )
-from evopolicy_worker.episodes.progress import CancelledJobError, Progress
 from evopolicy_worker.sandbox.jail import Jail
 from evopolicy_worker.sandbox.zygote import Child, Zygote
+from evopolicy_worker.slot_protocol import slot_messages as messages
+from evopolicy_worker.slot_protocol.begun import Begun
 
 MAX_CODES = 8
 """Policies whose compiled code is kept, at most 1 MiB each."""
@@ -35,8 +37,43 @@ _COUNT_S = 1.0
 takes it 50 µs and more."""
 
 
+class CancelledJobError(Exception):
+    """The job was cancelled while it ran."""
+
+
+class Progress:
+    """Progress of the running job; written by the loop, read by the monitor's thread, which hears of a
+    cancellation."""
+
+    def __init__(self) -> None:
+        self.episodes_done = 0
+        self.steps = 0
+        self.cancelled = False
+        self.policy: PolicyProcess | None = None
+        self.begun: tuple[int, Begun] | None = None
+        """The running episode, with its index in the job, that is reported when the job is stopped."""
+        self._given_up = False
+        self._lock = threading.Lock()
+
+    def give_up(self, send: Callable[[messages.Message], None] | None) -> None:
+        """Reports the started episode, once; the report is sent when this returns. With None, nothing more is
+        reported."""
+        with self._lock:
+            if send is not None and self.begun is not None and not self._given_up:
+                place, begun = self.begun
+                send(messages.Begun(place=place, begun=begun.packed()))
+            self._given_up = True
+
+    def cancel(self) -> None:
+        """Ends the running job at the next step, and the policy at once."""
+        self.cancelled = True
+        policy = self.policy
+        if policy is not None:
+            policy.kill()
+
+
 class Policies:
-    """Starts the processes of a slot's policies, and removes what is left of them."""
+    """The policy of each episode: its own, or one for several of a job. Removes what their processes leave behind."""
 
     def __init__(self, zygote: Zygote, jail: Jail, monitor: Monitor, scratch: Path) -> None:
         self._zygote = zygote
@@ -44,81 +81,22 @@ class Policies:
         self._monitor = monitor
         self._scratch = scratch
         self._prepared: Child | None = None
+        self._policy: PolicyProcess | None = None
         self._codes: dict[bytes, bytes] = {}
         self._n_policies = 0
         self._folders: list[Path] = []
         self._oom_kills, self._counted = oom_kills(), time.monotonic()
 
     def prepare(self) -> None:
-        """Bury the last policy and fork the process for the next; to be called while there is nothing else to do."""
+        """Buries the last policy and forks the process for the next; to be called while there is nothing else to do."""
         if self._prepared is None:
             self._prepared = self._spawn()
 
-    def start(self, limits: ResourceLimits) -> PolicyProcess:
-        """The process of the next policy."""
-        child, self._prepared = self._prepared, None
-        if child is None:
-            child = self._spawn()
-        self._n_policies += 1
-        folder = self._scratch / "policies" / str(self._n_policies)
-        if self._jail.home is None:
-            self._folders.append(folder)
-        own = str(folder), self._oom_kills
-        return PolicyProcess(self._zygote, child, self._monitor, self._jail, limits, *own)
-
-    def _spawn(self) -> Child:
-        self._bury()
-        child = self._zygote.spawn()
-        now = time.monotonic()
-        if now - self._counted > _COUNT_S:
-            self._oom_kills, self._counted = oom_kills(), now
-        return child
-
-    @property
-    def compiles(self) -> bool:
-        """Whether policies have the same folder, whose path is in their code."""
-        return self._jail.home is not None
-
-    def code(
-        self, source: bytes, limits: ResourceLimits, env_meta: dict[str, Any], progress: Progress
-    ) -> bytes:
-        """The code of this `policy.py`, compiled once for all episodes by a process of its own.
-
-        All policies load the same code, the first too, which could otherwise tell by its memory that it is the first.
-        """
-        code = self._codes.get(source)
-        if code is None:
-            compiler = progress.policy = self.start(limits)
-            try:
-                code = compiler.compiled(source, env_meta)
-            finally:
-                compiler.end()
-            if progress.cancelled:
-                raise CancelledJobError
-            while len(self._codes) >= MAX_CODES:
-                del self._codes[next(iter(self._codes))]
-            self._codes[source] = code
-        return code
-
-    def _bury(self) -> None:
-        """The processes of the policies so far are gone after this, and so are their folders."""
-        self._zygote.bury()
-        while self._folders:
-            remove_tree(self._folders.pop())
-
-    def close(self) -> None:
-        self._zygote.close()
-
-
-class JobPolicies:
-    """The policy of each episode of a job: its own, or one for several."""
-
-    def __init__(
-        self, policies: Policies, job: Job, files: BundleFiles | None, environment: Environment
+    def begin_job(
+        self, job: Job, files: messages.Files | None, environment: Environment, progress: Progress
     ) -> None:
-        self._policies = policies
-        self._job = job
-        self._files = files
+        """The policies of this job come from now on. `files`: its bundle."""
+        self._job, self._files, self._progress = job, files, progress
         description = environment.description
         self._env_meta = job.env_meta | {
             "obs_space": description.obs_space,
@@ -127,9 +105,8 @@ class JobPolicies:
         }
         if description.reward_components:
             self._env_meta["reward_components"] = dict(description.reward_texts)
-        self._policy: PolicyProcess | None = None
 
-    def take(self, k: int, spec: EpisodeSpec, progress: Progress) -> PolicyProcess:
+    def take(self, k: int, spec: EpisodeSpec) -> PolicyProcess:
         """The policy for the job's k-th episode, before its reset. Raises PolicyFailedError."""
         job, files = self._job, self._files
         assert files is not None
@@ -137,18 +114,14 @@ class JobPolicies:
             self._policy.begin_episode()
             return self._policy
         self.drop()
-        source = files.policy()
-        if source is None:
-            raise PolicyFailedError(
-                PolicyFailure(
-                    category="missing_policy",
-                    step_index=None,
-                    message="there is no policy.py in system/; it must hold a top-level class Policy",
-                )
-            )
-        policies, limits = self._policies, job.limits
-        code = policies.code(source, limits, self._env_meta, progress) if policies.compiles else b""
-        policy = self._policy = progress.policy = policies.start(limits)
+        ends = itertools.accumulate(size for _, _, size in files.names)
+        places = {name: (end - size, end) for (name, _, size), end in zip(files.names, ends, strict=True)}
+        if "policy.py" not in places:
+            text = "there is no policy.py in system/; it must hold a top-level class Policy"
+            raise PolicyFailedError(PolicyFailure(category="missing_policy", step_index=None, message=text))
+        # Where policies have the same folder, whose path is in their code.
+        code = self._code(files.data[slice(*places["policy.py"])]) if self._jail.home is not None else b""
+        policy = self._policy = self._start()
         policy.seal(files, spec.policy_seed, self._env_meta, job.observations)
         policy.load(code)
         return policy
@@ -167,10 +140,6 @@ class JobPolicies:
         self._policy = None
         return ended
 
-    def close(self, progress: Progress) -> None:
-        progress.policy = None
-        self.drop()
-
     def drop(self) -> None:
         """Ends the policy, if there is one; the next episode gets another one."""
         if self._policy is not None:
@@ -179,3 +148,44 @@ class JobPolicies:
             # The job itself has already reported a fault of the sandbox.
             with contextlib.suppress(EvopolicyError):
                 policy.end()
+
+    def _start(self) -> PolicyProcess:
+        """The process of the next policy."""
+        child, self._prepared = self._prepared or self._spawn(), None
+        self._n_policies += 1
+        folder = self._scratch / "policies" / str(self._n_policies)
+        if self._jail.home is None:
+            self._folders.append(folder)
+        own = self._job.limits, str(folder), self._oom_kills
+        self._progress.policy = PolicyProcess(self._zygote, child, self._monitor, self._jail, *own)
+        return self._progress.policy
+
+    def _spawn(self) -> Child:
+        """A process for the next policy, once those of the policies so far are gone with their folders."""
+        self._zygote.bury()
+        while self._folders:
+            remove_tree(self._folders.pop())
+        child = self._zygote.spawn()
+        now = time.monotonic()
+        if now - self._counted > _COUNT_S:
+            self._oom_kills, self._counted = oom_kills(), now
+        return child
+
+    def _code(self, source: bytes) -> bytes:
+        """The code of this `policy.py`, compiled once for all episodes by a process of its own.
+
+        All policies load the same code, the first too, which could otherwise tell by its memory that it is the first.
+        """
+        code = self._codes.get(source)
+        if code is None:
+            compiler = self._start()
+            try:
+                code = compiler.compiled(source, self._env_meta)
+            finally:
+                compiler.end()
+            if self._progress.cancelled:
+                raise CancelledJobError
+            while len(self._codes) >= MAX_CODES:
+                del self._codes[next(iter(self._codes))]
+            self._codes[source] = code
+        return code

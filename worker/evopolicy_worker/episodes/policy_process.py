@@ -10,6 +10,7 @@ Rules:
 from __future__ import annotations
 
 import contextlib
+import json
 import os
 import resource
 import signal
@@ -29,6 +30,7 @@ from evopolicy_worker.sandbox.inside import player
 from evopolicy_worker.sandbox.jail import Jail
 from evopolicy_worker.sandbox.zygote import Child, Exit, Zygote, wait_dead
 from evopolicy_worker.slot_protocol import endings
+from evopolicy_worker.slot_protocol import slot_messages as messages
 from evopolicy_worker.slot_protocol.endings import EndedFromOutsideError, Ending
 
 _OURS = ("common", "worker", "coordinator", "results", "gateway")
@@ -89,26 +91,8 @@ class PolicyFailedError(Exception):
         self.failure = failure
 
 
-class BundleFiles(NamedTuple):
-    """A bundle's files, read once per job."""
-
-    names: list[tuple[str, bool, int]]
-    """Path, executable, size in bytes."""
-    data: bytes
-    """Their contents, one after another."""
-
-    def policy(self) -> bytes | None:
-        """The contents of `policy.py`; None without such a file."""
-        at = 0
-        for name, _, size in self.names:
-            if name == "policy.py":
-                return self.data[at : at + size]
-            at += size
-        return None
-
-
 class Ended(NamedTuple):
-    """What a policy leaves at its end: output, and processor time in seconds."""
+    """A policy's output and processor time, seconds, when it or its episode ends."""
 
     stdout: bytes
     stderr: bytes
@@ -160,7 +144,7 @@ class PolicyProcess:
 
         Only Python's compiler reads it here: this process runs none of it.
         """
-        self.seal(BundleFiles([("policy.py", False, len(source))], source), bytes(16), env_meta, "arrays")
+        self.seal(messages.Files([("policy.py", False, len(source))], source), bytes(16), env_meta, "arrays")
         try:
             return self._request(player.COMPILE, "init", self._limits.init_wall_s)
         except PolicyFailedError:
@@ -173,9 +157,9 @@ class PolicyProcess:
         Raises PolicyFailedError with a category of NO_POLICY.
         """
         self._watch.spent_s = 0.0
-        self._request(player.LOAD, "init", self._limits.init_wall_s, payload=code)
+        self._request(player.LOAD, "init", self._limits.init_wall_s, 0, code)
 
-    def seal(self, bundle: BundleFiles, seed: bytes, env_meta: dict[str, Any], observations: str) -> None:
+    def seal(self, bundle: messages.Files, seed: bytes, env_meta: dict[str, Any], observations: str) -> None:
         """Gives the process its bundle and its limits, and takes its rights away."""
         limits = self._limits
         needed = 16 * frames.elements(env_meta["action_space"])
@@ -209,7 +193,8 @@ class PolicyProcess:
         }
         self._write = frames.compile_writer(env_meta["obs_space"])
         self._monitor.watch(self._watch)
-        self._expect_ok(frames.init_frame(init, bundle.data), "seal", _SEAL_S)
+        head = json.dumps(init).encode()
+        self._request(player.INIT, "seal", _SEAL_S, len(head), head, bundle.data)
 
     def begin_episode(self) -> None:
         """Wall, CPU time and output count from here; the first episode's include the import."""
@@ -219,11 +204,8 @@ class PolicyProcess:
         """Raises PolicyFailedError."""
         self._surplus_bytes = 0
         self._request(player.RESET, "reset", self._limits.act_wall_s, episode_index)
-
-    def prepare_acts(self) -> None:
-        """After `reset`: does once the work that `act` would otherwise do on every step."""
+        # Here for all steps of the episode, which have the same limit.
         self._watch.what = "act"
-        self._watch.answer_limit_s = self._limits.act_wall_s
 
     def act(self, obs: Any) -> Any:
         """The policy's answer to one observation, as it returned it. Raises PolicyFailedError."""
@@ -239,22 +221,19 @@ class PolicyProcess:
                 how = f"it sent an action of {len(payload):,} bytes; {self._action_bytes:,} are the limit"
                 raise self._broken(how, self._action_bytes, len(payload))
             if len(payload) > self._usual_bytes:
-                self._count_surplus(len(payload) - self._usual_bytes)
+                # Actions are kept as they came, so their bytes beyond the usual size also have a limit in an episode.
+                self._surplus_bytes += len(payload) - self._usual_bytes
+                limit, used = self._limits.episode_action_bytes, self._surplus_bytes
+                if used > limit:
+                    text = (
+                        f"actions larger than the action space needs came to {used:,} bytes in this episode;"
+                    )
+                    raise self._failed("act_error", f"{text} {limit:,} are the limit", "", limit, used)
             try:
                 return frames.action(tag, payload, self._action_bytes // player.VALUE_BYTES)
             except frames.BadReplyError as error:
                 raise self._broken(str(error)) from None
         raise self._reported_failure(tag, payload, "act")
-
-    def _count_surplus(self, n_bytes: int) -> None:
-        """Actions are kept as they came; their bytes beyond the usual size are also bounded for the whole episode."""
-        self._surplus_bytes += n_bytes
-        limit = self._limits.episode_action_bytes
-        if self._surplus_bytes > limit:
-            text = f"actions larger than the action space needs came to {self._surplus_bytes:,} bytes in this episode;"
-            raise self._failed(
-                "act_error", f"{text} {limit:,} are the limit", limit=limit, used=self._surplus_bytes
-            )
 
     def take_output(self) -> Ended:
         """Output and CPU time of the episode that ends; the policy lives on when it can.
@@ -266,13 +245,15 @@ class PolicyProcess:
                 self._request(player.FLUSH, "act", _GRACE_S)
         if self.dead:
             return self.end()
-        # Under the monitor's lock, so no other thread reads.
-        self._monitor.watch(None)
-        self._watch.drain()
-        cpu_s = self._watch.cpu_s() - self._watch.cpu_start_s
-        ended = Ended(self._watch.stdout.take(), self._watch.stderr.take(), cpu_s)
+        ended = self._output(self._watch.cpu_s() - self._watch.cpu_start_s)
         self._monitor.watch(self._watch)
         return ended
+
+    def _output(self, cpu_s: float) -> Ended:
+        # From here on no other thread reads it.
+        self._monitor.watch(None)
+        self._watch.drain()
+        return Ended(self._watch.stdout.take(), self._watch.stderr.take(), cpu_s)
 
     def end(self) -> Ended:
         """End the process, if it has not ended, and collect what it leaves."""
@@ -280,11 +261,8 @@ class PolicyProcess:
             if not self.dead:
                 with contextlib.suppress(PolicyFailedError, EndedFromOutsideError):
                     self._request(player.END, "act", _GRACE_S)
-            watch = self._watch
-            cpu_s = self._cpu_of_episode() if self.dead else max(0.0, watch.cpu_s() - watch.cpu_start_s)
-            self._monitor.watch(None)
-            watch.drain()
-            self._finished = Ended(watch.stdout.take(), watch.stderr.take(), cpu_s)
+            alive_s = max(0.0, self._watch.cpu_s() - self._watch.cpu_start_s)
+            self._finished = self._output(self._cpu_of_episode() if self.dead else alive_s)
             with self._closing:
                 if self._gone:
                     self._child.close()
@@ -301,20 +279,15 @@ class PolicyProcess:
 
     # Requests and replies.
 
-    def _request(
-        self, kind: int, what: str, limit_s: float, argument: int = 0, payload: bytes = b""
-    ) -> bytes:
-        return self._expect_ok(
-            [player.REQUEST_HEADER.pack(len(payload), kind, argument), payload], what, limit_s
-        )
-
-    def _expect_ok(self, parts: list[bytes], what: str, limit_s: float) -> bytes:
-        self._watch.what = what
-        self._watch.answer_limit_s = limit_s
-        tag, payload = self._exchange(parts, sum(map(len, parts)))
+    def _request(self, kind: int, stage: str, limit_s: float, argument: int = 0, *payload: bytes) -> bytes:
+        """The answer to a request that succeeds. Raises PolicyFailedError."""
+        self._watch.what, self._watch.answer_limit_s = stage, limit_s
+        length = sum(map(len, payload))
+        header = player.REQUEST_HEADER.pack(length, kind, argument)
+        tag, answer = self._exchange([header, *payload], 16 + length)
         if tag != player.OK:
-            raise self._reported_failure(tag, payload, what)
-        return payload
+            raise self._reported_failure(tag, answer, stage)
+        return answer
 
     def _exchange(self, parts: list[Any], total: int) -> tuple[int, bytes]:
         watch = self._watch
@@ -360,21 +333,21 @@ class PolicyProcess:
 
     # How it failed.
 
-    def _reported_failure(self, tag: int, payload: bytes, what: str) -> PolicyFailedError:
+    def _reported_failure(self, tag: int, payload: bytes, asked: str) -> PolicyFailedError:
         """The failure that the policy's process reports of itself."""
-        if what == "seal":
+        if asked == "seal":
             # None of the bundle's code has run: this is ours.
             self._bury()
             raise SandboxError(
                 f"a policy's process could not seal itself: {payload.decode('utf-8', 'replace')}"
             )
         if tag != player.FAILED:
-            return self._broken(f"it answered {what} with frame {tag}")
+            return self._broken(f"it answered {asked} with frame {tag}")
         try:
             report = frames.report(payload)
         except frames.BadReplyError as error:
             return self._broken(str(error))
-        stage = report.stage if what == "init" and report.stage in ("import", "init") else what
+        stage = report.stage if asked == "init" and report.stage in ("import", "init") else asked
         category = _STAGES[stage]
         limit, used = None, None
         message = report.message
@@ -400,7 +373,7 @@ class PolicyProcess:
         """The failure of a process that broke the rules of its pipes, which is ended."""
         self._bury()
         text = f"the policy's process was ended: {how}"
-        return self._failed(self._fatal("killed"), text, limit=limit, used=used)
+        return self._failed(self._fatal("killed"), text, "", limit, used)
 
     def _died(self) -> PolicyFailedError:
         """Its pipe closed: the policy's failure, by the table of endings. EndedFromOutsideError when it is none."""
@@ -421,10 +394,8 @@ class PolicyProcess:
         elif exit_ is None:
             ending, text = Ending("sandbox", "SIGKILL"), "the policy's sandbox ended"
         else:
-            ending, text = (
-                Ending("policy", endings.how(exit_.status)),
-                f"the policy's process {exit_.describe()}",
-            )
+            ending = Ending("policy", endings.how(exit_.status))
+            text = f"the policy's process {exit_.describe()}"
             if os.WIFEXITED(exit_.status) and os.WEXITSTATUS(exit_.status) == _SHIM_BROKEN:
                 text += ", as it does when the code in it that answers for the policy was broken"
             if os.WIFSIGNALED(exit_.status) and os.WTERMSIG(exit_.status) == signal.SIGBUS:
@@ -435,13 +406,13 @@ class PolicyProcess:
                 raise EndedFromOutsideError(f"a policy's process could not seal itself: {text}")
             raise EndedFromOutsideError(f"{text}, and neither the policy nor a limit can have done that")
         _, _, limit, used = verdict or (None, None, None, None)
-        return self._failed(self._fatal(category), text, limit=limit, used=used)
+        return self._failed(self._fatal(category), text, "", limit, used)
 
     def _limit_of(self, exit_: Exit) -> Verdict | None:
         """The limit for which the system ended it."""
+        limits, cpu_s = self._limits, self._cpu_of_episode()
         if not os.WIFSIGNALED(exit_.status):
             return None
-        limits, cpu_s = self._limits, self._cpu_of_episode()
         if cpu_s > limits.cpu_s:
             text = f"the policy used more than {limits.cpu_s:g} s of CPU time"
             return Verdict("cpu_limit", text, limits.cpu_s, cpu_s)
@@ -478,21 +449,20 @@ class PolicyProcess:
         self,
         category: FailureCategory,
         message: str,
-        traceback: str = "",
-        limit: float | None = None,
-        used: float | None = None,
+        traceback: str,
+        limit: float | None,
+        used: float | None,
     ) -> PolicyFailedError:
         self._watch.since = 0.0
-        return PolicyFailedError(
-            PolicyFailure(
-                category=category,
-                step_index=None,
-                message=self._without_paths(message)[:_MAX_MESSAGE],
-                traceback=self._without_paths(traceback)[-_MAX_TRACEBACK:],
-                limit=limit,
-                used=used,
-            )
+        failure = PolicyFailure(
+            category=category,
+            step_index=None,
+            message=self._without_paths(message)[:_MAX_MESSAGE],
+            traceback=self._without_paths(traceback)[-_MAX_TRACEBACK:],
+            limit=limit,
+            used=used,
         )
+        return PolicyFailedError(failure)
 
     def _without_paths(self, text: str) -> str:
         """Text without this machine's folders: `system/policy.py`, `python3.11/random.py`, `numpy/…`."""

@@ -1,11 +1,16 @@
-"""An episode's video: `python -m evopolicy_worker.episodes.video ENV_ID`, started by `recording.VideoRecorder`.
+"""An episode's video: the slot's `VideoRecorder`, and the process that it starts,
+`python -m evopolicy_worker.episodes.video ENV_ID`.
 
 Rules:
-- The episode is replayed from its actions in a rendering environment of this process. The original episode never
+- The episode is replayed from its actions in a rendering environment of that process. The original episode never
   renders: its bytes are the same with and without a video, and no policy is charged for rendering.
 - Frame t shows the state in which row t's action was chosen, that of the row's observation. There are as many frames as
   rows, and the state after the last step has none.
 - A replay that differs from the episode in any reward or flag yields no video, since it would show another episode.
+- A video is optional. Where an environment cannot be rendered here, or the renderer crashes or times out, the episode
+  keeps its outcome without a video, and a note on standard error gives the reason.
+- The process renders one environment only, since a second one with MuJoCo's renderer has crashed processes. It is the
+  slot's child: pinned to the same core, and ended with the slot.
 - One episode at a time: a framed `Order` on standard input, a framed `Made` on the original standard output. Output of
   simulators and drivers goes to standard error.
 """
@@ -14,8 +19,12 @@ from __future__ import annotations
 
 import io
 import os
+import select
+import subprocess
 import sys
-from collections.abc import Iterable, Iterator
+import time
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator
 from typing import BinaryIO
 
 import msgspec
@@ -24,13 +33,23 @@ import numpy as np
 from evopolicy_common.catalogue import Entry
 from evopolicy_common.errors import WorkerError
 from evopolicy_common.installation import add_extra
-from evopolicy_common.messages.environment import Case
+from evopolicy_common.messages.environment import Case, EnvironmentDescription
 from evopolicy_common.records.episodes.trajectory import decode
 from evopolicy_worker import environments
 from evopolicy_worker.environments import Environment, Frame
-from evopolicy_worker.slot_protocol.child_pipes import take_pipes
-from evopolicy_worker.slot_protocol.slot_messages import LENGTH
+from evopolicy_worker.environments.interface.calls import note
+from evopolicy_worker.slot_protocol.slot_messages import LENGTH, framed, take_pipes, unframed
 
+START_S = 120.0
+"""Time for the process to start and import its simulator."""
+FRAME_S = 1.0
+"""Time for each frame. The slowest take about 0.06 s."""
+MAX_S = 1800.0
+"""Maximum time for one video; below the hour of grace that a lease has beyond its episode's limits."""
+MAX_FAILURES = 3
+"""Number of consecutive failures after which this slot makes no more videos of an environment."""
+_POLL_S = 0.1
+_PIECE = 1 << 20
 CRF = 28
 """x264's constant rate factor: 200 frames of 600 × 400 come to some 66 KiB."""
 PRESET = "veryfast"
@@ -54,6 +73,107 @@ class Made(msgspec.Struct, frozen=True, kw_only=True):
     mp4: bytes | None
     error: str = ""
     """Why there is no video."""
+
+
+class VideoRecorder:
+    """Makes videos of played episodes. Not thread-safe."""
+
+    def __init__(self, start_s: float = START_S, frame_s: float = FRAME_S) -> None:
+        """Timeouts for the start and for each frame, in seconds."""
+        self._start_s = start_s
+        self._frame_s = frame_s
+        self._process: subprocess.Popen[bytes] | None = None
+        self._env = ""
+        self._failures: Counter[str] = Counter()
+        self._noted: set[str] = set()
+
+    def record(
+        self,
+        description: EnvironmentDescription,
+        case: Case,
+        actions: bytes,
+        length: int,
+        cancelled: Callable[[], bool],
+    ) -> bytes | None:
+        """MP4 bytes of an episode of `length` rows; None when it cannot be made, or once `cancelled()` is true.
+
+        `actions`: the episode's trajectory with record "actions".
+        """
+        env = description.env
+        if not description.renders:
+            self._note(f"no video: {env} does not render")
+            return None
+        if self._failures[env] >= MAX_FAILURES:
+            return None
+        deadline = time.monotonic() + min(MAX_S, self._start_s + self._frame_s * length)
+        try:
+            made = self._ask(env, framed(Order(case=case, actions=actions)), deadline, cancelled)
+        except (OSError, WorkerError) as error:
+            made = Made(mp4=None, error=str(error))
+        if made is not None and made.mp4 is not None:
+            self._failures[env] = 0
+            return made.mp4
+        self.close()
+        if made is not None:
+            self._failures[env] += 1
+            self._note(f"no video of an episode of {env}: {made.error}")
+            if self._failures[env] == MAX_FAILURES:
+                self._note(f"{env}: {MAX_FAILURES} videos in a row failed; this slot makes no more of it")
+        return None
+
+    def close(self) -> None:
+        """Ends the process; the next `record` starts it again. A second close does nothing."""
+        process, self._process = self._process, None
+        if process is not None:
+            process.kill()
+            process.wait()
+            for pipe in (process.stdin, process.stdout):
+                assert pipe is not None
+                pipe.close()
+
+    def _ask(self, env: str, order: bytes, deadline: float, cancelled: Callable[[], bool]) -> Made | None:
+        """The process's answer; None when cancelled. Raises OSError, or WorkerError when the process ends or times
+        out."""
+        if self._env != env:
+            self.close()
+        if self._process is None:
+            self._process = subprocess.Popen(
+                [sys.executable, "-m", "evopolicy_worker.episodes.video", env, *environments.definition(env)],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                bufsize=0,
+                env={**os.environ, **environments.process_environment(render=True)},
+            )
+            self._env = env
+        process = self._process
+        assert process.stdin is not None
+        assert process.stdout is not None
+        orders, replies = process.stdin.fileno(), process.stdout.fileno()
+        os.set_blocking(orders, False)
+        unsent, received = memoryview(order), bytearray()
+        while not (answers := unframed(received)):
+            if cancelled():
+                return None
+            if time.monotonic() > deadline:
+                raise WorkerError("it took too long")
+            readable, writable, _ = select.select([replies], [orders] if unsent else [], [], _POLL_S)
+            if writable:
+                unsent = unsent[os.write(orders, unsent[:_PIECE]) :]
+            if readable:
+                piece = os.read(replies, _PIECE)
+                if not piece:
+                    raise WorkerError(f"the process that draws it ended with status {process.wait()}")
+                received += piece
+        return msgspec.msgpack.decode(answers[0], type=Made)
+
+    def _note(self, text: str) -> None:
+        """Prints each note once per slot."""
+        if text not in self._noted:
+            self._noted.add(text)
+            note(text)
+
+
+# The rest runs in the process.
 
 
 def encoded(frames: Iterable[Frame], rate: int) -> bytes:
@@ -114,9 +234,8 @@ def replay(environment: Environment, case: Case, actions: bytes) -> Iterator[Fra
 def serve(env_id: str, orders: BinaryIO, replies: BinaryIO) -> None:
     """Record one episode after another until there are no more orders."""
     environment: Environment | None = None
-    decoder = msgspec.msgpack.Decoder(Order)
     while head := orders.read(LENGTH.size):
-        order = decoder.decode(orders.read(LENGTH.unpack(head)[0]))
+        order = msgspec.msgpack.decode(orders.read(LENGTH.unpack(head)[0]), type=Order)
         try:
             if environment is None:
                 environment = environments.make(env_id, render=True)
@@ -124,10 +243,9 @@ def serve(env_id: str, orders: BinaryIO, replies: BinaryIO) -> None:
             made = Made(mp4=encoded(replay(environment, order.case, order.actions), rate))
         except Exception as error:
             # Drivers and simulators raise any exception here, and a missing picture is no failure of the episode.
-            what = str(error) if isinstance(error, WorkerError) else f"{type(error).__name__}: {error}"
-            made = Made(mp4=None, error=what)
-        data = msgspec.msgpack.encode(made)
-        replies.write(LENGTH.pack(len(data)) + data)
+            why = str(error) if isinstance(error, WorkerError) else f"{type(error).__name__}: {error}"
+            made = Made(mp4=None, error=why)
+        replies.write(framed(made))
         replies.flush()
 
 

@@ -64,22 +64,13 @@ _own_folders: dict[str, str] = {}
 
 def variables(scratch: Path) -> dict[str, str]:
     """All environment variables of the process."""
-    passed_on = {
-        name: value
-        for name, value in os.environ.items()
-        if name in _PASSED_ON or name.startswith(_PASSED_ON_PREFIXES)
-    }
+    own = {name: os.environ[name] for name in os.environ if name.startswith(_PASSED_ON_PREFIXES)}
+    own |= {name: os.environ[name] for name in _PASSED_ON if name in os.environ}
     path = [os.path.abspath(entry) for entry in _folders("PYTHONPATH")]
-    ours = [entry for entry in path if os.path.realpath(entry) in _our_folders()]
-    own = {
-        **({"PYTHONPATH": os.pathsep.join(ours)} if ours else {}),
-        _LATER_PATH: os.pathsep.join(path),
-        "PATH": "/usr/bin:/bin",
-        "HOME": f"{scratch}/home",
-        "TMPDIR": f"{scratch}/tmp",
-        "PYTHONDONTWRITEBYTECODE": "1",
-    }
-    return {**passed_on, **own, **process_environment()}
+    if ours := [entry for entry in path if os.path.realpath(entry) in _our_folders()]:
+        own["PYTHONPATH"] = os.pathsep.join(ours)
+    own |= {_LATER_PATH: os.pathsep.join(path), "PATH": "/usr/bin:/bin", "PYTHONDONTWRITEBYTECODE": "1"}
+    return own | {"HOME": f"{scratch}/home", "TMPDIR": f"{scratch}/tmp"} | process_environment()
 
 
 def command(
@@ -166,7 +157,11 @@ def _seal(tier: Tier, scratch: Path, user: int | None, drawn_with: tuple[str, ..
         inside.check(inside.libc.prctl(38, 1, 0, 0, 0), "no_new_privs")
         namespaces = tier == "bwrap"
         signals = namespaces or jail.landlock_version() >= _SCOPES_SIGNALS
-        _install(seccomp.environment_filter(namespaces=namespaces, signals=signals))
+        program = seccomp.environment_filter(namespaces=namespaces, signals=signals)
+        # For all threads, without the mitigations of speculation with which older kernels slow filtered processes.
+        arguments, _buffer = inside.filter_of(program, os.getpid())
+        number, flags = SECCOMP[platform.machine()], _ALL_THREADS | _SPECULATION
+        inside.check(inside.libc.syscall(number, _SET_MODE_FILTER, flags, arguments), "seccomp")
 
 
 @contextlib.contextmanager
@@ -183,20 +178,12 @@ def expendable() -> Iterator[None]:
             path.write_text(before)
 
 
-def _install(program: bytes) -> None:
-    """Installs a filter for all threads, without the mitigations of speculation with which older kernels slow filtered
-    processes."""
-    arguments, _buffer = inside.filter_of(program, os.getpid())
-    number, flags = SECCOMP[platform.machine()], _ALL_THREADS | _SPECULATION
-    inside.check(inside.libc.syscall(number, _SET_MODE_FILTER, flags, arguments), "seccomp")
-
-
 @contextlib.contextmanager
-def _explained(what: str) -> Iterator[None]:
+def _explained(attempt: str) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        raise SandboxError(f"the environment process cannot {what}: {error}") from error
+        raise SandboxError(f"the environment process cannot {attempt}: {error}") from error
 
 
 # The file system of the process.
@@ -241,17 +228,18 @@ def _code(declared: Sequence[str]) -> list[str]:
     named = _folders("LD_LIBRARY_PATH")
     named += [os.path.dirname(os.path.realpath(path)) for path in (os.environ.get(BROWSER, ""),) if path]
     named += filter(_is_installed, path)
-    listed = [entry for entry in named if not _holds_home(os.path.realpath(entry))]
+    home = os.path.realpath(os.path.expanduser("~"))
+    listed = [entry for entry in named if not _below(home, os.path.realpath(entry).rstrip("/"))]
     wanted = [*_installation(), *listed]
     places = {*map(os.path.abspath, wanted), *map(os.path.realpath, wanted)}
     own = [entry for entry in path if not _is_installed(entry)]
     for folder in {*map(os.path.abspath, own), *map(os.path.realpath, own)}:
         places |= {*user_code.modules(folder)}
-    found: list[str] = []
+    outermost: list[str] = []
     for place in sorted({*places, *declared}):
-        if os.path.exists(place) and not any(_below(place, other) for other in ("/usr", *found)):
-            found.append(place)
-    return found
+        if os.path.exists(place) and not any(_below(place, other) for other in ("/usr", *outermost)):
+            outermost.append(place)
+    return outermost
 
 
 def _folders(variable: str) -> list[str]:
@@ -269,10 +257,6 @@ def _is_installed(path: str) -> bool:
     if os.path.basename(real) in _INSTALLATIONS or not os.path.isdir(real):
         return True
     return any(_below(real, os.path.realpath(folder)) for folder in ("/usr", *_installation()))
-
-
-def _holds_home(path: str) -> bool:
-    return _below(os.path.realpath(os.path.expanduser("~")), path.rstrip("/"))
 
 
 def _our_folders() -> list[str]:

@@ -3,26 +3,28 @@
 from __future__ import annotations
 
 import ctypes
+import glob
 import os
 import secrets
 import shutil
+import sys
+import sysconfig
 from collections.abc import Sequence
 from pathlib import Path
 
 import msgspec
 
-from evopolicy_common.errors import SandboxError
+from evopolicy_common.errors import ConfigError, SandboxError
 from evopolicy_common.messages.episode import Tier
 from evopolicy_common.processes import distribution
-from evopolicy_common.processes.packages import modules_of
-from evopolicy_worker.sandbox import python_files, seccomp
+from evopolicy_common.processes.packages import check_alone, files_of, modules_of
+from evopolicy_worker.sandbox import seccomp
 
 INSIDE = Path(__file__).parent / "inside"
-"""The only modules of this software that the sandbox shows: `zygote`, `player` and `files`."""
-
-
+"""The only modules of this software that the sandbox shows."""
 POLICY_HOME = "/home/policy"
 _PACKAGES = "/packages"
+_SITE_FOLDERS = ("site-packages", "dist-packages")
 _PLACE = "/own"
 _DEVICES = ("/dev/null", "/dev/full", "/dev/random", "/dev/urandom")
 """Without `/dev/zero`: mapped, it is shared memory without a file, and its inode numbers come from a machine-wide
@@ -51,6 +53,22 @@ START = ENVIRONMENT | {"LD_BIND_NOW": "1"}
 for those that it calls, and removes the additional variable."""
 
 
+class _PythonFiles(msgspec.Struct, frozen=True, kw_only=True):
+    """Files of this machine that the sandbox shows, read-only: the standard library, shared libraries, and only the
+    allowed packages. The site-packages folder is never shown as a whole, since it has simulators and our own code."""
+
+    interpreter: str
+    """The interpreter's real file: not a link, nor the launcher of a virtual environment."""
+    read: tuple[str, ...]
+    """Files and folders, shown at their own paths."""
+    libraries: tuple[str, ...]
+    """Those paths in `read` that hold the system's shared libraries, of which Python needs only a few."""
+    hidden: tuple[str, ...]
+    """Folders below those in `read` that must appear empty."""
+    packages: dict[str, str]
+    """Modules, packages and their bundled libraries: name in the packages folder → path on this machine."""
+
+
 class Jail(msgspec.Struct, frozen=True, kw_only=True):
     """A command that starts a zygote, and the zygote's configuration."""
 
@@ -76,7 +94,7 @@ def plan(
     `user`: as root, the user id outside of the sandbox's user; None picks one (`some_user`). `sealed=False` omits what
     a policy's process does to itself (limits, Landlock, the filter), for tests that show the attacks that these stop.
     """
-    files = python_files.find(allowed_packages)
+    files = _python_files(allowed_packages)
     config: dict[str, object] = {
         "become_nobody": False,
         "namespaces": tier == "bwrap",
@@ -139,13 +157,50 @@ def landlock_version() -> int:
     return max(0, int(ctypes.CDLL(None).syscall(444, None, 0, 1)))
 
 
-def _python(files: python_files.PythonFiles, folder: str) -> tuple[str, ...]:
+def _python_files(allowed_packages: tuple[str, ...]) -> _PythonFiles:
+    """For this interpreter, and these packages with their dependencies. Raises SandboxError that names the package when
+    it is not installed or cannot be shown alone."""
+    interpreter = os.path.realpath(getattr(sys, "_base_executable", sys.executable))
+    prefix = os.path.realpath(sys.base_prefix)
+    read = [interpreter]
+    if prefix == "/usr":
+        read += [sysconfig.get_path("stdlib"), sysconfig.get_path("platstdlib")]
+    else:
+        # A separate prefix (pyenv, conda, uv, /usr/local) also has shared libraries beside the standard library.
+        read.append(f"{prefix}/lib")
+    try:
+        packages = files_of(allowed_packages)
+        if more := [name for name in allowed_packages if name != "numpy"]:
+            check_alone(more)
+    except ConfigError as error:
+        raise SandboxError(f"packages that policies may import: {error}") from error
+    # The C library, its loader and the system's shared libraries.
+    libraries = ["/lib64", "/etc/ld.so.cache", "/lib", "/usr/lib64", "/usr/lib"]
+    triplet = sysconfig.get_config_var("MULTIARCH")
+    if triplet and os.path.isdir(f"/lib/{triplet}"):
+        libraries[2:] = [f"/lib/{triplet}", f"/usr/lib/{triplet}", *map(str, Path("/lib").glob("ld-linux*"))]
+    read += libraries
+    # Not resolved: `/lib` is a link to `/usr/lib` on most systems, and both names are used.
+    existing = tuple(dict.fromkeys(path for path in read if os.path.exists(path)))
+    # Folders of installed packages below them.
+    below = [folder for root in existing for folder in (root, *glob.glob(f"{root}/python3*"))]
+    site = filter(os.path.isdir, (f"{folder}/{name}" for folder in below for name in _SITE_FOLDERS))
+    return _PythonFiles(
+        interpreter=interpreter,
+        read=existing,
+        libraries=tuple(path for path in existing if path in libraries),
+        hidden=tuple(sorted({*map(os.path.realpath, site)})),
+        packages=packages,
+    )
+
+
+def _python(files: _PythonFiles, folder: str) -> tuple[str, ...]:
     # No site (-S), no user site (-s), no script folder on the path (-P): only the standard library and allowed
     # packages.
     return (files.interpreter, "-s", "-S", "-P", "-B", f"{folder}/zygote.py")
 
 
-def _bubblewrap(files: python_files.PythonFiles, as_root: bool) -> list[str]:
+def _bubblewrap(files: _PythonFiles, as_root: bool) -> list[str]:
     # As root, the zygote makes the user namespace itself, so that the policy's user is unprivileged outside too.
     rights = ("CAP_SYS_ADMIN", *(("CAP_SETUID", "CAP_SETGID") if as_root else ()))
     command = [*bubblewrap("policy", own_user=not as_root, rights=rights), "--clearenv"]
@@ -172,7 +227,7 @@ def _bubblewrap(files: python_files.PythonFiles, as_root: bool) -> list[str]:
     return [*command, "--chdir", "/", "--remount-ro", "/"]
 
 
-def _own_files(files: python_files.PythonFiles) -> dict[str, object]:
+def _own_files(files: _PythonFiles) -> dict[str, object]:
     """Folders that the zygote replaces by copies (of `libraries`, only the files needed), and the folder where it makes
     them."""
     folders: list[str] = []
@@ -194,7 +249,7 @@ def parents(paths: list[str]) -> list[str]:
     return sorted({str(parent) for path in paths for parent in Path(path).parents} - {"/"})
 
 
-def _package_links(files: python_files.PythonFiles, scratch: Path) -> Path:
+def _package_links(files: _PythonFiles, scratch: Path) -> Path:
     """Makes a folder that has only links to the allowed packages."""
     folder = scratch / "packages"
     shutil.rmtree(folder, ignore_errors=True)

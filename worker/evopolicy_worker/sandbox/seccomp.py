@@ -27,6 +27,7 @@ import os
 import platform
 import signal
 import termios
+from collections.abc import Iterable
 
 from evopolicy_common.errors import SandboxError
 from evopolicy_common.seccomp import (
@@ -167,7 +168,9 @@ def policy_filter(*, sees_the_machines_files: bool = False) -> bytes:
         blocks |= {"truncate": [refuse(errno.EPERM)], "open": _no_cutting(1), "openat": _no_cutting(2)}
         # Its flags are in memory, which a filter cannot read.
         blocks["openat2"] = [refuse(errno.ENOSYS)]
-    return _assembled(machine, _intervals(numbers, blocks))
+    by_number = {number: blocks.get(name, [ALLOWED]) for name, number in numbers.items()}
+    refused = [[refuse(errno.EPERM)]] * _HIGHEST_LISTED + [[refuse(errno.ENOSYS)]]
+    return _assembled(machine, (by_number.get(number, code) for number, code in enumerate(refused)))
 
 
 def environment_filter(*, namespaces: bool, signals: bool) -> bytes:
@@ -196,12 +199,7 @@ def environment_filter(*, namespaces: bool, signals: bool) -> bytes:
     ]
     # Its flags are in memory, which a filter cannot read. The C library falls back to `clone`.
     blocks[numbers["clone3"]] = [refuse(errno.ENOSYS)]
-    intervals: list[Interval] = []
-    for number in range(max(blocks) + 2):
-        code = blocks.get(number, [ALLOWED])
-        if not intervals or intervals[-1][1] != code:
-            intervals.append((number, code))
-    return _assembled(machine, intervals)
+    return _assembled(machine, (blocks.get(number, [ALLOWED]) for number in range(max(blocks) + 2)))
 
 
 def _machine() -> str:
@@ -213,20 +211,14 @@ def _machine() -> str:
     return machine
 
 
-def _assembled(machine: str, intervals: list[Interval]) -> bytes:
-    """The whole program: kills the process on a call of another architecture, and looks up all other calls."""
+def _assembled(machine: str, codes: Iterable[list[Instruction]]) -> bytes:
+    """The whole program: kills the process on a call of another architecture, and looks up all other calls. `codes`: of
+    each call number; the last is that of all higher ones too."""
+    intervals: list[Interval] = []
+    for number, code in enumerate(codes):
+        if not intervals or intervals[-1][1] != code:
+            intervals.append((number, code))
     return program(machine, KILLED, _search(intervals))
-
-
-def _intervals(numbers: dict[str, int], blocks: dict[str, list[Instruction]]) -> list[Interval]:
-    """The code for every call number, as intervals in ascending order. Each extends to the start of the next."""
-    by_number = {number: blocks.get(name, [ALLOWED]) for name, number in numbers.items()}
-    found: list[Interval] = []
-    for number in range(_HIGHEST_LISTED + 1):
-        code = by_number.get(number, [refuse(errno.EPERM if number < _HIGHEST_LISTED else errno.ENOSYS)])
-        if not found or found[-1][1] != code:
-            found.append((number, code))
-    return found
 
 
 def _search(intervals: list[Interval]) -> list[Instruction]:

@@ -27,43 +27,43 @@ _INIT = tuple(f"__init__{suffix}" for suffix in _MODULES)
 
 def modules(folder: str) -> list[str]:
     """Paths of what is shown of a folder on the module search path, which need not exist."""
-    found: list[str] = []
+    shown: list[str] = []
     for entry in _entries(folder):
         if entry.is_file() and entry.name.endswith(_MODULES):
-            found.append(entry.path)
+            shown.append(entry.path)
         elif entry.is_dir() and (
             entry.name.endswith(_INSTALLED) or any(os.path.exists(f"{entry.path}/{name}") for name in _INIT)
         ):
-            found += content(entry.path)
-    return found
+            shown += content(entry.path)
+    return shown
 
 
 def content(path: str) -> list[str]:
-    """What is shown of a file, or of a folder: the folder itself if it has nothing that is hidden. Raises SandboxError
+    """The paths that are shown of a file or folder: the folder itself if nothing in it is hidden. Raises SandboxError
     where that are too many files."""
     if not os.path.isdir(path):
         return [path]
-    found, whole = _content(path)
-    if len(found) > _MOST and not whole:
+    shown, whole = _content(path)
+    if len(shown) > _MOST and not whole:
         raise SandboxError(
-            f"{path} has {len(found):,} files and folders to show one by one, and {_MOST:,} are the limit: move hidden"
+            f"{path} has {len(shown):,} files and folders to show one by one, and {_MOST:,} are the limit: move hidden"
             " files, keys, links and run directories out of it"
         )
-    return [path] if whole else found
+    return [path] if whole else shown
 
 
 def declared(definitions: Iterable[Entry], folders: Sequence[str]) -> list[str]:
-    """What is shown for these definitions in addition: their data, and their modules, wherever those are installed.
+    """The paths shown for these definitions in addition: their data, and their modules, wherever those are installed.
 
     `folders`: those that are searched for modules before this process's own.
     """
-    found: dict[str, None] = {}
+    shown: dict[str, None] = {}
     for entry in definitions:
         names = (entry.gymnasium_id or "", *(wrapper.wrapper for wrapper in entry.wrappers))
         places = [_place(name.partition(":")[0].partition(".")[0], folders) for name in names if ":" in name]
         for path in (*entry.data, *map(os.path.realpath, entry.data), *filter(None, places)):
-            found |= dict.fromkeys(content(path))
-    return list(found)
+            shown |= dict.fromkeys(content(path))
+    return list(shown)
 
 
 def mirror(folder: str, shown: Iterable[str], place: Path) -> None:
@@ -87,9 +87,8 @@ def _place(top: str, folders: Sequence[str]) -> str:
         return ""
     if spec is None:
         return ""
-    places = list(spec.submodule_search_locations or ())
-    found = places[0] if places else spec.origin or ""
-    return found if os.path.isabs(found) else ""
+    place = next(iter(spec.submodule_search_locations or ()), spec.origin or "")
+    return place if os.path.isabs(place) else ""
 
 
 def _entries(folder: str) -> list[os.DirEntry[str]]:
@@ -97,32 +96,28 @@ def _entries(folder: str) -> list[os.DirEntry[str]]:
     read."""
     try:
         with os.scandir(folder) as listed:
-            found = sorted(listed, key=lambda entry: entry.name)
+            entries = sorted(listed, key=lambda entry: entry.name)
     except OSError:
         return []
-    return [entry for entry in found if not entry.name.startswith(".") and not entry.name.endswith(_KEYS)]
-
-
-def _is_ours(folder: str) -> bool:
-    return any(os.path.lexists(f"{folder}/{name}") for name in _OURS)
+    return [entry for entry in entries if not entry.name.startswith(".") and not entry.name.endswith(_KEYS)]
 
 
 def _content(folder: str) -> tuple[list[str], bool]:
-    """What is shown of a folder, and whether that is all of it."""
-    if _is_ours(folder):
+    """The paths that are shown of a folder, and whether they are all of it."""
+    if any(os.path.lexists(f"{folder}/{name}") for name in _OURS):
         return [], False
-    found: list[str] = []
+    shown: list[str] = []
     entries = _entries(folder)
     whole = len(entries) == len(os.listdir(folder))
     for entry in entries:
         if entry.is_dir(follow_symlinks=False):
             inner, entirely = _content(entry.path)
-            found += [entry.path] if entirely else inner
+            shown += [entry.path] if entirely else inner
             whole = whole and entirely
         elif entry.is_file():
-            found.append(entry.path)
-            # A link is shown with what it names, which a folder as a whole would not have.
+            shown.append(entry.path)
+            # A link is shown with its target, which a folder as a whole would not have.
             whole = whole and not entry.is_symlink()
         else:
             whole = False
-    return found, whole
+    return shown, whole

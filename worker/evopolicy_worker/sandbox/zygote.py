@@ -100,10 +100,8 @@ class Zygote:
             except (OSError, SandboxError) as error:
                 self.close()
                 output.seek(0)
-                words = output.read(4000).decode("utf-8", "replace").strip()
-                raise SandboxError(
-                    f"the sandbox does not start: {error}; {words or 'no stderr output'}"
-                ) from error
+                words = output.read(4000).decode("utf-8", "replace").strip() or "no stderr output"
+                raise SandboxError(f"the sandbox does not start: {error}; {words}") from error
         try:
             # Detects a host that cannot make processes here. Also, the first two forks leave traces that later ones
             # could see.
@@ -117,13 +115,8 @@ class Zygote:
     def spawn(self) -> Child:
         """Forks a policy process. Raises SlotDiedError when the zygote is gone, SandboxError when it cannot make a
         process."""
-        ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        ours.settimeout(ANSWER_TIMEOUT_S)
         try:
-            with ours:
-                with theirs:
-                    socket.send_fds(self._control, [b"fk"], [theirs.fileno()])
-                reply, fds, _, _ = socket.recv_fds(ours, _MAX_MESSAGE, 5, socket.MSG_CMSG_CLOEXEC)
+            reply, fds = self._ask(b"fk")
             if not reply:
                 raise ConnectionResetError("the policy's process was not created")
         except OSError as error:
@@ -132,20 +125,23 @@ class Zygote:
             raise SandboxError(f"cannot create the policy's process: {reply.decode('utf-8', 'replace')}")
         return Child(pid_of(fds[0]), *fds)
 
+    def _ask(self, request: bytes, *fds: int) -> tuple[bytes, list[int]]:
+        """The answer to a request with these descriptors, and the descriptors in it. Raises OSError."""
+        ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        with ours:
+            ours.settimeout(ANSWER_TIMEOUT_S)
+            with theirs:
+                socket.send_fds(self._control, [request], [*fds, theirs.fileno()])
+            return socket.recv_fds(ours, _MAX_MESSAGE, 5, socket.MSG_CMSG_CLOEXEC)[:2]
+
     def wait(self, child: Child) -> Exit:
         """Reaps a child that was killed or has ended. Raises SlotDiedError when the zygote does not reply."""
-        ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         try:
-            with ours:
-                ours.settimeout(ANSWER_TIMEOUT_S)
-                with theirs:
-                    socket.send_fds(self._control, [b"w"], [child.pidfd, theirs.fileno()])
-                report = ours.recv(_MAX_MESSAGE)
+            report, _ = self._ask(b"w", child.pidfd)
             code, status, user_s, user_us, system_s, system_us, peak = _REPORT.unpack_from(report)
         except (OSError, struct.error) as error:
-            raise SlotDiedError(
-                f"the sandbox did not report how a policy's process ended: {error}"
-            ) from error
+            why = f"the sandbox did not report how a policy's process ended: {error}"
+            raise SlotDiedError(why) from error
         status = status << 8 if code == os.CLD_EXITED else status
         cpu_s = user_s + system_s + (user_us + system_us) / 1e6
         return Exit(status=status, cpu_s=cpu_s, peak_bytes=peak * 1024)
@@ -180,8 +176,11 @@ class Zygote:
             data, fds, _, _ = socket.recv_fds(self._control, _MAX_MESSAGE, 4, socket.MSG_CMSG_CLOEXEC)
             answer = json.loads(data) if data else {"error": "it closed its end"}
             if "map" in answer:
-                assert jail.user is not None
-                _map_user(pid_of(fds[0]), jail.user)
+                # The namespace's user 65534 is the unprivileged user of that id outside.
+                folder = Path(f"/proc/{pid_of(fds[0])}")
+                (folder / "setgroups").write_text("deny")
+                for name in ("gid_map", "uid_map"):
+                    (folder / name).write_text(f"65534 {jail.user} 1\n")
                 os.close(fds[0])
                 self._control.send(b"mapped")
             elif "ready" in answer:
@@ -204,10 +203,3 @@ def wait_dead(pidfd: int, timeout_s: float) -> bool:
         if poller.poll(remaining_s * 1000):
             return True
     return False
-
-
-def _map_user(pid: int, user: int) -> None:
-    """Maps the namespace's user 65534 to the unprivileged user id `user` of this machine."""
-    Path(f"/proc/{pid}/setgroups").write_text("deny")
-    Path(f"/proc/{pid}/gid_map").write_text(f"65534 {user} 1\n")
-    Path(f"/proc/{pid}/uid_map").write_text(f"65534 {user} 1\n")

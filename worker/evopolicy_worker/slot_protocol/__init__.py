@@ -1,1 +1,1 @@
-"""What a slot's supervisor and its environment process say to each other, and what each end of one means."""
+"""The messages of a slot's supervisor and its environment process, and the meaning of each end of a process."""

@@ -116,7 +116,7 @@ class Log:
     def write(self, begun: Begun) -> None:
         """Writes the episode anew."""
         self._at, self._full = 0, False
-        self._append(_encoder.encode(_Head(job=self._job, place=self._place, begun=begun.packed())))
+        self._append(_encoder.encode((self._job, self._place, begun.packed())))
 
     def add(self, action: Any) -> None:
         """Adds an action. Lists take a quarter of the time of arrays, and `repair` makes the same actions of them."""
@@ -139,17 +139,6 @@ class Log:
         except OSError:
             self._full = True
 
-    def close(self) -> None:
-        self._map.close()
-        os.close(self._file)
-
-
-class _Head(msgspec.Struct, frozen=True, kw_only=True):
-    job: str
-    place: int
-    """The episode's index in the job."""
-    begun: PackedBegun
-
 
 def _frames(data: bytes) -> Iterator[bytes]:
     """The parts of a `Log`, up to its end."""
@@ -163,12 +152,12 @@ def _frames(data: bytes) -> Iterator[bytes]:
 
 
 def recovered(folder: Path, job: str) -> _Places:
-    """The job's episode that an ended process has left in its scratch folder; empty when there is none."""
+    """The job's episode that an ended process wrote to its scratch folder; empty when there is none."""
     with contextlib.suppress(OSError, StopIteration, *DECODE_ERRORS):
         frames = _frames(read_regular(folder / FILE, MAX_PACKED_BYTES))
-        head = _head.decode(next(frames))
-        if head.job == job:
-            return {head.place: msgspec.structs.replace(head.begun, more=tuple(frames))}
+        own_job, place, begun = _head.decode(next(frames))
+        if own_job == job:
+            return {place: msgspec.structs.replace(begun, more=tuple(frames))}
     return {}
 
 
@@ -184,7 +173,8 @@ class HandedBack(NamedTuple):
 _Places = dict[int, PackedBegun]
 _encoder = msgspec.msgpack.Encoder()
 _decoder = msgspec.msgpack.Decoder(_Places)
-_head = msgspec.msgpack.Decoder(_Head)
+_head = msgspec.msgpack.Decoder(tuple[str, int, PackedBegun])
+"""The first part of a `Log`: job, index in it, and the episode so far."""
 
 
 def is_kept(job: Job) -> bool:
@@ -194,11 +184,11 @@ def is_kept(job: Job) -> bool:
 
 def pack(places: Mapping[int, PackedBegun]) -> HandedBack | None:
     """The started episodes of a job by their index; None when there are none, or when they are too large."""
-    found = {place: each for place, each in places.items() if each.actions or each.more or each.failure}
-    data = _encoder.encode(found)
-    if not found or len(data) > MAX_PACKED_BYTES:
+    started = {place: each for place, each in places.items() if each.actions or each.more or each.failure}
+    data = _encoder.encode(started)
+    if not started or len(data) > MAX_PACKED_BYTES:
         return None
-    failures = [each.failure for each in found.values() if each.failure is not None]
+    failures = [each.failure for each in started.values() if each.failure is not None]
     limits = any(failure.category in TIME_LIMITS or failure.limit is not None for failure in failures)
     return HandedBack(data, limits)
 

@@ -60,7 +60,7 @@ class Ending(NamedTuple):
 class Row(NamedTuple):
     """A kind of ending and its verdict. None in a condition matches anything."""
 
-    what: str
+    name: str
     first: First
     how: tuple[How, ...] | None
     verdict: FailureCategory | Literal["limit", "outside"]
@@ -73,20 +73,19 @@ class Row(NamedTuple):
 
     def fits(self, ending: Ending) -> bool:
         """Whether an ending is of this kind."""
-        return (
-            ending.first == self.first
-            and (self.how is None or ending.how in self.how)
-            and self.limit in (None, ending.limit is not None)
-            and self.began in (None, ending.began)
-            and self.held in (None, ending.held)
-            and self.again in (None, ending.again)
-        )
+        wanted = (self.first, self.limit, self.began, self.held, self.again)
+        facts = (ending.first, ending.limit is not None, ending.began, ending.held, ending.again)
+        known = all(want in (None, fact) for want, fact in zip(wanted, facts, strict=True))
+        return known and (self.how is None or ending.how in self.how)
 
 
 _CODE: dict[str, bool] = {"limit": False, "began": True}
 """Of a policy whose code has begun, where no limit explains the ending."""
 _KILLED: tuple[How, ...] = ("SIGKILL", "stop")
 _CRASH: tuple[How, ...] = ("exit", "fault")
+_FROM_OUTSIDE: tuple[How, ...] = (*_KILLED, "signal", "pipe", "frame")
+_SEALED = "killed or stopped, sealed, and no limit explains it"
+_OVERRAN_AGAIN = "the environment overran on its actions, as in earlier attempts"
 TABLE: tuple[Row, ...] = (
     Row("a policy's process before the bundle's code", "policy", None, "outside", began=False),
     Row("a limit was passed", "policy", None, "limit", limit=True, began=True),
@@ -96,31 +95,13 @@ TABLE: tuple[Row, ...] = (
     Row("it closed its pipe", "policy", ("pipe",), "killed", **_CODE),
     Row("it broke the pipes' rules", "policy", ("frame",), "killed", **_CODE),
     Row("killed or stopped where it can signal itself", "policy", _KILLED, "killed", **_CODE, held=False),
-    Row(
-        "killed or stopped, sealed, and no limit explains it",
-        "policy",
-        _KILLED,
-        "outside",
-        **_CODE,
-        held=True,
-    ),
+    Row(_SEALED, "policy", _KILLED, "outside", **_CODE, held=True),
     Row("bubblewrap or the zygote", "sandbox", None, "outside"),
     Row("the environment crashed on its actions", "environment", _CRASH, "killed", began=True),
     Row("the environment crashed before any", "environment", _CRASH, "outside", began=False),
-    Row(
-        "the environment overran on its actions, as in earlier attempts",
-        "environment",
-        ("overrun",),
-        "killed",
-        again=True,
-    ),
+    Row(_OVERRAN_AGAIN, "environment", ("overrun",), "killed", again=True),
     Row("the environment overran", "environment", ("overrun",), "outside", again=False),
-    Row(
-        "the environment was killed or stopped",
-        "environment",
-        (*_KILLED, "signal", "pipe", "frame"),
-        "outside",
-    ),
+    Row("the environment was killed or stopped", "environment", _FROM_OUTSIDE, "outside"),
     Row("the worker", "supervisor", None, "outside"),
 )
 """Every ending fits exactly one row."""
@@ -145,16 +126,9 @@ def verdict(ending: Ending) -> FailureCategory | None:
     return ending.limit if row.verdict == "limit" else row.verdict
 
 
-def broken_down(ending: Ending) -> PolicyFailure | None:
-    """The policy's failure for an ending of the environment's process; None for an infrastructure failure."""
-    return None if verdict(ending) is None else BROKE_DOWN
-
-
 def how(status: int) -> How:
     """How a process ended, from its waitpid status."""
     if not os.WIFSIGNALED(status):
         return "exit"
     number = os.WTERMSIG(status)
-    if number == signal.SIGKILL:
-        return "SIGKILL"
-    return "fault" if number in FAULTS else "signal"
+    return "SIGKILL" if number == signal.SIGKILL else "fault" if number in FAULTS else "signal"

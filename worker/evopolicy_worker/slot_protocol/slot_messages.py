@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import signal
 import struct
 
 import msgspec
@@ -9,17 +11,18 @@ import msgspec
 from evopolicy_common.catalogue import Entry
 from evopolicy_common.messages.environment import EnvironmentDescription
 from evopolicy_common.messages.episode import BlobRef, EpisodeOutcome, Job, PolicyFailure, Tier
+from evopolicy_common.processes.parent_death import end_with_parent
 from evopolicy_worker.environments.interface.calls import Limits
 from evopolicy_worker.slot_protocol.begun import PackedBegun
 
 LENGTH = struct.Struct("<I")
 
 
-class Message(msgspec.Struct, frozen=True, kw_only=True, tag_field="op"):
+class Message(msgspec.Struct, frozen=True, kw_only=True, tag_field="op", tag=str.lower):
     """A message; `op` names its type."""
 
 
-class Start(Message, frozen=True, kw_only=True, tag="start"):
+class Start(Message, frozen=True, kw_only=True):
     """The first message: how to set up the slot. Answered by Ready or Fault."""
 
     tier: Tier
@@ -37,54 +40,54 @@ class Start(Message, frozen=True, kw_only=True, tag="start"):
     """Of the environments."""
 
 
-class Files(msgspec.Struct, frozen=True, kw_only=True):
+class Files(msgspec.Struct, frozen=True):
     """A bundle's files, which the process cannot read from disk."""
 
-    key: str
-    names: list[tuple[str, bool, int]] | None
-    """Path, executable flag and size in bytes of each file. None: this bundle is the one that was sent last."""
+    names: list[tuple[str, bool, int]]
+    """Path, executable flag and size in bytes of each file."""
     data: bytes
     """The files' contents, concatenated."""
 
 
-class Play(Message, frozen=True, kw_only=True, tag="play"):
+class Play(Message, frozen=True, kw_only=True):
     """Play this job. The replies are any number of Progress; for each episode Acting, when its policy's first action
     is due, and Finished; Begun when an episode is stopped; Filmed for each video; and last Played or Fault."""
 
     job: Job
     bundle: Files | None
+    """None: the job has none, or the one that was sent last."""
     first: int = 0
     """Index in the job of the first episode to play."""
     failure: PolicyFailure | None = None
     """The policy's failure in that episode: it crashed the process that played it before."""
 
 
-class Describe(Message, frozen=True, kw_only=True, tag="describe"):
+class Describe(Message, frozen=True, kw_only=True):
     """Describe these environments. Answered by Described or Fault."""
 
     environments: tuple[str, ...]
 
 
-class Cancel(Message, frozen=True, kw_only=True, tag="cancel"):
+class Cancel(Message, frozen=True, kw_only=True):
     """Stop the running job, which then ends with Played."""
 
 
-class Ready(Message, frozen=True, kw_only=True, tag="ready"):
+class Ready(Message, frozen=True, kw_only=True):
     """The process and its sandbox have started."""
 
 
-class Progress(Message, frozen=True, kw_only=True, tag="progress"):
+class Progress(Message, frozen=True, kw_only=True):
     """Progress of the running job."""
 
     episodes_done: int
     steps: int
 
 
-class Acting(Message, frozen=True, kw_only=True, tag="acting"):
+class Acting(Message, frozen=True, kw_only=True):
     """In the job's next episode, the first action of the policy is about to reach the environment."""
 
 
-class Finished(Message, frozen=True, kw_only=True, tag="finished"):
+class Finished(Message, frozen=True, kw_only=True):
     """The outcome of the job's next episode."""
 
     outcome: EpisodeOutcome
@@ -95,7 +98,7 @@ class Finished(Message, frozen=True, kw_only=True, tag="finished"):
     episode is, since the policy can measure the time."""
 
 
-class Filmed(Message, frozen=True, kw_only=True, tag="filmed"):
+class Filmed(Message, frozen=True, kw_only=True):
     """The video of one of the job's finished episodes."""
 
     place: int
@@ -103,7 +106,7 @@ class Filmed(Message, frozen=True, kw_only=True, tag="filmed"):
     video: BlobRef
 
 
-class Begun(Message, frozen=True, kw_only=True, tag="begun"):
+class Begun(Message, frozen=True, kw_only=True):
     """The policy's actions so far in a stopped episode. Sent on Cancel, and before a Fault."""
 
     place: int
@@ -111,19 +114,19 @@ class Begun(Message, frozen=True, kw_only=True, tag="begun"):
     begun: PackedBegun
 
 
-class Played(Message, frozen=True, kw_only=True, tag="played"):
+class Played(Message, frozen=True, kw_only=True):
     """The job is over: every episode has been reported by Finished, or it was cancelled."""
 
     cancelled: bool = False
 
 
-class Described(Message, frozen=True, kw_only=True, tag="described"):
+class Described(Message, frozen=True, kw_only=True):
     """The requested environments, in the order of the request."""
 
     environments: tuple[EnvironmentDescription, ...]
 
 
-class Fault(Message, frozen=True, kw_only=True, tag="fault"):
+class Fault(Message, frozen=True, kw_only=True):
     """An infrastructure failure, never the policy's."""
 
     kind: str
@@ -134,12 +137,41 @@ class Fault(Message, frozen=True, kw_only=True, tag="fault"):
 Command = Start | Play | Describe | Cancel
 Reply = Ready | Progress | Acting | Finished | Filmed | Begun | Played | Described | Fault
 
-encoder = msgspec.msgpack.Encoder()
 commands: msgspec.msgpack.Decoder[Command] = msgspec.msgpack.Decoder(Command)
 replies: msgspec.msgpack.Decoder[Reply] = msgspec.msgpack.Decoder(Reply)
+encoder = msgspec.msgpack.Encoder()
 
 
-def framed(message: Message) -> bytes:
+def framed(message: msgspec.Struct) -> bytes:
     """The encoded message, prefixed by its length."""
     data = encoder.encode(message)
     return LENGTH.pack(len(data)) + data
+
+
+def unframed(received: bytearray) -> list[bytes]:
+    """Takes the complete messages out of the bytes that have arrived."""
+    complete: list[bytes] = []
+    size = LENGTH.size
+    while len(received) >= size and len(received) >= (end := size + LENGTH.unpack_from(received)[0]):
+        complete.append(bytes(received[size:end]))
+        del received[:end]
+    return complete
+
+
+def take_pipes() -> tuple[int, int]:
+    """In a worker's child process: moves standard input and output to new descriptors and returns these, for commands
+    and answers.
+
+    From now on standard input is empty, and prints of simulators and drivers go to standard error. Ctrl-C and SIGTERM
+    are ignored; the parent handles them, and this process ends with its parent.
+    """
+    end_with_parent(signal.SIGKILL)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    # A batch system sends it to all processes of a job. Processes started from here inherit this. So does a policy,
+    # whose failure it would be otherwise.
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    commands, replies = os.dup(0), os.dup(1)
+    with open(os.devnull) as nothing:
+        os.dup2(nothing.fileno(), 0)
+    os.dup2(2, 1)
+    return commands, replies

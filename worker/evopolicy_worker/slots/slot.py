@@ -18,6 +18,7 @@ import signal
 from collections import deque
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import msgspec
 
@@ -96,7 +97,8 @@ class Slot:
         """Whether an environment that may remember has played a hidden episode in the current process."""
         self._scratch = scratch
         self._cancelled = False
-        self._sent = ""
+        self._sent: Path | None = None
+        """The folder of the bundle that the process has."""
         self._kept = ""
         """The last job, if its policy's actions remain valid."""
         self._begun: dict[int, PackedBegun] = {}
@@ -120,24 +122,17 @@ class Slot:
         """
         await self.close()
         self._scratch.mkdir(parents=True, exist_ok=True)
-        self._sent = ""
+        self._sent = None
         self._saw_hidden = False
         for name in ("home", "tmp"):  # must not pass files from the previous process to this one
             remove_tree(self._scratch / name)
-        start = self._start
-        starting = asyncio.ensure_future(
-            asyncio.create_subprocess_exec(
-                *env_jail.command(
-                    start.tier, self._scratch, draws=start.draws, definitions=start.definitions
-                ),
-                stdin=asyncio.subprocess.PIPE,
-                stdout=asyncio.subprocess.PIPE,
-                stderr=asyncio.subprocess.PIPE,
-                env=env_jail.variables(self._scratch),
-                start_new_session=True,
-                limit=1 << 20,
-            )
+        start, pipe = self._start, asyncio.subprocess.PIPE
+        command = env_jail.command(
+            start.tier, self._scratch, draws=start.draws, definitions=start.definitions
         )
+        options: dict[str, Any] = {"env": env_jail.variables(self._scratch), "start_new_session": True}
+        options |= {"stdin": pipe, "stdout": pipe, "stderr": pipe, "limit": 1 << 20}
+        starting = asyncio.ensure_future(asyncio.create_subprocess_exec(*command, **options))
         try:
             self._process = await asyncio.shield(starting)
         except asyncio.CancelledError:
@@ -150,15 +145,14 @@ class Slot:
             async with asyncio.timeout(START_TIMEOUT_S):
                 await self._send(start)
                 reply = await self._reply()
+            failed = None if isinstance(reply, messages.Ready) else _error(reply)
         except TimeoutError:
-            await self.close()
-            raise WorkerError(f"a slot did not start within {START_TIMEOUT_S:g} s") from None
+            failed = WorkerError(f"a slot did not start within {START_TIMEOUT_S:g} s")
         except SlotDiedError as error:
+            failed = WorkerError(str(error))
+        if failed is not None:
             await self.close()
-            raise WorkerError(str(error)) from error
-        if not isinstance(reply, messages.Ready):
-            await self.close()
-            raise _error(reply)
+            raise failed
 
     async def prepare(self, env_ids: Sequence[str]) -> None:
         """Starts the processes if necessary and makes these environments, so that later jobs find them ready. Raises as
@@ -191,15 +185,16 @@ class Slot:
             if job.video and not self._start.draws and env_jail.graphics_devices():
                 self._start = msgspec.structs.replace(self._start, draws=True)
                 await self.start()
-            # What an environment remembers of a hidden episode must not reach the policy of a train episode.
+            # No memory that an environment has of a hidden episode must reach the policy of a train episode.
             if self._saw_hidden and job.record == "full":
                 await self.start()
             while True:
-                files = None if bundle is None else messages.Files(key=str(bundle), names=None, data=b"")
-                if bundle is not None and str(bundle) != self._sent:
+                files = None
+                if bundle is not None and bundle != self._sent:
                     files = await asyncio.to_thread(bundle_files, bundle)
                 if self._cancelled:
                     return ()
+                self._sent = bundle or self._sent
                 play = messages.Play(job=job, bundle=files, first=len(self._outcomes), failure=failure)
                 try:
                     return await self._attempt(play, on_progress)
@@ -208,7 +203,7 @@ class Slot:
                 await self.start()
         except asyncio.CancelledError:
             # The rest of this job's answers will not be read, so the processes cannot be used again.
-            self._end_process()
+            _kill(self._process)
             raise
         finally:
             watcher.cancel()
@@ -222,7 +217,6 @@ class Slot:
         # Here, as a process that dies of a hidden episode is replaced by one that plays it again.
         self._saw_hidden = self._saw_hidden or (play.job.record != "full" and remembers(play.job.env))
         await self._send(play)
-        self._sent = play.bundle.key if play.bundle is not None else self._sent
         while True:
             match await self._reply():
                 case messages.Progress() as reply:
@@ -248,8 +242,8 @@ class Slot:
         told = isinstance(error, BrokenEnvironmentError)
         how = "overrun" if told or self._hung else self._how_it_ended()
         again = self._acting and job.environment_faults >= endings.AGAIN
-        failure = endings.broken_down(Ending("environment", how, began=self._acting, again=again))
-        if failure is None or self._cancelled or job.bundle is None:
+        ours = endings.verdict(Ending("environment", how, began=self._acting, again=again)) is None
+        if ours or self._cancelled or job.bundle is None:
             if told:
                 raise error
             why = f"environment {job.env}: its process ended while it played; {error}"
@@ -257,8 +251,8 @@ class Slot:
         log.warning("slot died on a policy's actions", job=job.job_id, error=self._hung or str(error))
         self._hung = ""
         if begun.is_kept(job):
-            self._begun[len(self._outcomes)] = PackedBegun(failure=failure)
-        return failure
+            self._begun[len(self._outcomes)] = PackedBegun(failure=endings.BROKE_DOWN)
+        return endings.BROKE_DOWN
 
     @property
     def begun(self) -> HandedBack | None:
@@ -278,7 +272,7 @@ class Slot:
                     await self._send(messages.Describe(environments=(env_id,)))
                     reply = await self._reply()
             except TimeoutError:
-                self._end_process()
+                _kill(self._process)
                 why = hung(f"environment {env_id}, make, reset or step", limits)
                 raise BrokenEnvironmentError(why) from None
             except SlotDiedError as error:
@@ -290,8 +284,7 @@ class Slot:
         return tuple(descriptions)
 
     def memory_bytes(self) -> int:
-        """Resident memory of all of the slot's processes; each has its part of what several share, as a browser's
-        do."""
+        """Resident memory of all of the slot's processes; each has its part of the memory that several share."""
         return 0 if self._process is None else _memory(self._process.pid)
 
     def cpu_s(self) -> float:
@@ -311,13 +304,13 @@ class Slot:
                 await self._idle.wait()
         except TimeoutError:
             if process is self._process:
-                self._end_process()
+                _kill(process)
 
     async def close(self) -> None:
         """Ends the slot's processes and removes its scratch folder. A second close does nothing."""
         process, self._process = self._process, None
+        _kill(process)
         if process is not None:
-            _kill(process)
             await process.wait()
             # Open as long as any process in the jail lives; the kernel kills those after the jail's first process.
             with contextlib.suppress(TimeoutError):
@@ -330,10 +323,6 @@ class Slot:
                 await self._listener
             self._listener = None
         await asyncio.to_thread(remove_tree, self._scratch)
-
-    def _end_process(self) -> None:
-        if self._process is not None:
-            _kill(self._process)
 
     async def _send(self, message: messages.Message) -> None:
         process = self._process
@@ -376,11 +365,11 @@ class Slot:
             n_replies = self._n_replies
             if silent_s >= longest_s:
                 self._hung = hung(f"environment {env_id}, reset or step", self._start.limits)
-                self._end_process()
+                _kill(process)
                 silent_s = 0.0
             if stood_s >= STOPPED_S:
                 log.warning("slot was stopped from outside", for_s=stood_s)
-                self._end_process()
+                _kill(process)
 
     def _broken(self, text: str) -> WorkerError:
         """The error for a process that ended: by itself or in a call that does not return, or from outside."""
@@ -436,14 +425,13 @@ def _children(pid: int, tier: Tier) -> list[int]:
 
 
 def _memory(pid: int) -> int:
-    # Where the kernel does not show it, what several share counts for each.
+    # Where the kernel does not show it, memory that several share counts for each.
     sizes = (proc.proportional_bytes(each.pid) or proc.sizes(each.pid) for each in proc.family(pid))
     return sum(size if isinstance(size, int) else (size or (0, 0))[1] for size in sizes)
 
 
 def bundle_files(folder: Path) -> messages.Files:
     """The unpacked bundle in `folder`. Raises WorkerError when it cannot be read."""
-    key = str(folder)
     names: list[tuple[str, bool, int]] = []
     data: list[bytes] = []
     for root, folders, files in os.walk(folder):
@@ -459,7 +447,7 @@ def bundle_files(folder: Path) -> messages.Files:
                 raise WorkerError(f"the unpacked bundle cannot be read: {error}") from error
             names.append((os.path.relpath(path, folder), executable, len(content)))
             data.append(content)
-    return messages.Files(key=key, names=names, data=b"".join(data))
+    return messages.Files(names, b"".join(data))
 
 
 _FAULTS = {"sandbox": SandboxError, "environment": BrokenEnvironmentError}
@@ -471,7 +459,8 @@ def _error(reply: messages.Reply) -> EvopolicyError:
     return _FAULTS.get(reply.kind, WorkerError)(reply.message)
 
 
-def _kill(process: asyncio.subprocess.Process) -> None:
-    with contextlib.suppress(ProcessLookupError):
-        # The whole group: the sandbox dies with its parent, but simulators' helper processes only with the group.
-        os.killpg(process.pid, signal.SIGKILL)
+def _kill(process: asyncio.subprocess.Process | None) -> None:
+    if process is not None:
+        with contextlib.suppress(ProcessLookupError):
+            # The whole group: the sandbox dies with its parent, but simulators' helper processes only with the group.
+            os.killpg(process.pid, signal.SIGKILL)

@@ -272,15 +272,14 @@ def test_output_beyond_its_limit_is_read_and_dropped() -> None:
     import os
 
     reading, writing = os.pipe()
-    os.set_blocking(reading, False)
-    output = Output(10)
+    output = Output(reading, 10)
     os.write(writing, b"12345678")
-    output.drain(reading)
+    output.drain()
     os.write(writing, b"90abc")
-    output.drain(reading)
+    output.drain()
     assert output.open
     os.close(writing)
-    output.drain(reading)
+    output.drain()
     assert not output.open
     assert output.take() == b"1234567890"
     os.close(reading)

@@ -221,7 +221,6 @@ def test_the_file_of_an_episode_holds_actions_of_any_form_and_length(
     found = begun.recovered(tmp_path, "job")[0].unpacked().taken
     assert [each.action for each in found] == [*range(len(found))]
     assert 50_000 < len(found) < 600_000
-    log.close()
 
 
 @pytest.mark.parametrize(

@@ -26,10 +26,10 @@ from evopolicy_worker import environments
 from evopolicy_worker.environments.families.toy import Line
 from evopolicy_worker.environments.interface.actions import compile_actions
 from evopolicy_worker.episodes import frames
-from evopolicy_worker.episodes.loop import Player
+from evopolicy_worker.episodes.loop import Player, _blob
 from evopolicy_worker.episodes.monitor import Monitor
-from evopolicy_worker.episodes.policy_process import BundleFiles, PolicyProcess
-from evopolicy_worker.episodes.progress import Progress
+from evopolicy_worker.episodes.policies import Progress
+from evopolicy_worker.episodes.policy_process import PolicyProcess
 from evopolicy_worker.sandbox import jail
 from evopolicy_worker.sandbox.inside import player as shim
 from evopolicy_worker.sandbox.zygote import Zygote
@@ -106,8 +106,6 @@ def test_whatever_comes_as_an_action_reaches_the_hand_in_whole(
         played.append(None, action, 0.0, False, False, {})
     outcome = EpisodeOutcome(index=0, episode_return=0.0, length=1, terminated=False, truncated=True)
     for each in (recorder, played):
-        from evopolicy_worker.episodes.loop import _blob
-
         outcome = msgspec.structs.replace(outcome, trajectory=_blob(each.finish()))
         assert results_reported(outcome) == outcome
 
@@ -275,9 +273,9 @@ def player(tmp_path: Path, monitor: Monitor, monkeypatch: pytest.MonkeyPatch) ->
     monkeypatch.setattr(environments, "make", lambda env_id, **options: Fragile.__new__(Fragile))
     monkeypatch.setattr(Fragile, "__new__", lambda cls: _like(cls, toy))
     plan = jail.plan("none", tmp_path, ("numpy",))
-    found = Player(Zygote(plan, tmp_path), plan, monitor, tmp_path)
-    yield found
-    found.close()
+    zygote = Zygote(plan, tmp_path)
+    yield Player(zygote, plan, monitor, tmp_path)
+    zygote.close()
 
 
 def _like(cls: Any, toy: Any) -> Any:
@@ -289,9 +287,7 @@ def _like(cls: Any, toy: Any) -> Any:
 def play(player: Player, slots: Slots, source: str, n: int = 1, **options: Any) -> list[EpisodeOutcome]:
     job = make_job(tier="none", n=n, **options)
     outcomes: list[EpisodeOutcome] = []
-    files = bundle_files(slots.bundle(source))
-    assert files.names is not None
-    bundle = BundleFiles(files.names, files.data)
+    bundle = bundle_files(slots.bundle(source))
     last = player.play(job, bundle, Progress(), lambda frame: outcomes.extend(finished(frame)))
     outcomes.extend(finished(last))
     return outcomes

@@ -14,8 +14,8 @@ from slots import HONEST, Slots, acting, make_job, misbehaving, rows
 from evopolicy_common.messages.environment import Case
 from evopolicy_common.processes.proc import descendants
 from evopolicy_worker import environments
-from evopolicy_worker.episodes import float_environment
 from evopolicy_worker.episodes.loop import random_actions
+from evopolicy_worker.sandbox.inside.player import reset_floats
 from evopolicy_worker.sandbox.jail import ENVIRONMENT
 
 TIERS = ("bwrap", "landlock", "none")
@@ -360,7 +360,7 @@ def test_float_settings_are_the_defaults_whatever_was_set_before(slots: Slots) -
     try:
         assert libm.fesetround(upward) == 0
         assert 1.0 / float("3") > third
-        float_environment.reset()
+        reset_floats()
         assert libm.fegetround() == 0
         assert 1.0 / float("3") == third
     finally:

@@ -13,7 +13,7 @@ from slots import HONEST, Slots
 from evopolicy_common.messages.environment import Case
 from evopolicy_common.messages.episode import EpisodeOutcome
 from evopolicy_worker import environments
-from evopolicy_worker.episodes.recording import MAX_FAILURES, VideoRecorder
+from evopolicy_worker.episodes.video import MAX_FAILURES, VideoRecorder
 
 ENVIRONMENTS = ["toy/line", "toy/maze", "gymnasium/MiniGrid-FourRooms-v0", "gymnasium/roundabout-v0"]
 if ctypes.util.find_library("EGL"):

@@ -17,11 +17,12 @@ from slots import HONEST, QUICK, Slots, make_job
 
 from evopolicy_common.errors import SandboxError, SlotDiedError, WorkerError
 from evopolicy_worker import environments
-from evopolicy_worker.episodes import policy_process, recording
+from evopolicy_worker.episodes import policy_process, video
 from evopolicy_worker.episodes.monitor import Monitor
-from evopolicy_worker.episodes.policy_process import BundleFiles, PolicyProcess
+from evopolicy_worker.episodes.policy_process import PolicyProcess
 from evopolicy_worker.sandbox import doctor, jail, zygote
 from evopolicy_worker.sandbox.zygote import Child, Zygote
+from evopolicy_worker.slot_protocol import slot_messages as messages
 from evopolicy_worker.slots import slot
 
 SOON_S = 0.2
@@ -87,7 +88,7 @@ def test_a_child_that_does_not_seal_itself_is_killed(tmp_path: Path, monkeypatch
         description = environments.describe("toy/line")
         meta = {"obs_space": description.obs_space, "action_space": description.action_space}
         with pytest.raises(SandboxError, match="could not seal itself"):
-            policy.seal(BundleFiles([], b""), bytes(16), meta, "arrays")
+            policy.seal(messages.Files([], b""), bytes(16), meta, "arrays")
         assert policy.dead
         policy.end()
 
@@ -160,8 +161,8 @@ def test_a_video_that_takes_too_long_is_done_without(
 ) -> None:
     allowed: dict[str, Any] = {"start_s": 0.0, "frame_s": 0.0} if bound != "MAX_S" else {}
     if bound == "MAX_S":
-        monkeypatch.setattr(recording, "MAX_S", 0.0)
-    recorder = recording.VideoRecorder(**allowed)
+        monkeypatch.setattr(video, "MAX_S", 0.0)
+    recorder = video.VideoRecorder(**allowed)
     run = subprocess.Popen
     monkeypatch.setattr(
         subprocess, "Popen", lambda words, **more: run([sys.executable, "-c", "input()"], **more)

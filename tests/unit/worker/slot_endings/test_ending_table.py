@@ -38,9 +38,9 @@ EXAMPLES: dict[str, tuple[Ending, str | None]] = {
 }
 
 
-@pytest.mark.parametrize("row", TABLE, ids=lambda row: row.what)
+@pytest.mark.parametrize("row", TABLE, ids=lambda row: row.name)
 def test_each_row_of_the_table_gives_its_verdict(row: endings.Row) -> None:
-    ending, expected = EXAMPLES[row.what]
+    ending, expected = EXAMPLES[row.name]
     assert row.fits(ending)
     assert endings.verdict(ending) == expected
 

@@ -69,8 +69,8 @@ def copy_folder(source: str, target: str) -> None:
 
 
 def copy_file(source: str, target: str) -> None:
-    """With its time, by which Python knows whether compiled code is of this source. What may not be read is left
-    out."""
+    """With its time, by which Python knows whether compiled code is of this source. Leaves out unreadable
+    files."""
     try:
         fd = os.open(source, os.O_RDONLY)
     except PermissionError:
@@ -121,7 +121,7 @@ def needed(folders: list[str]) -> list[str]:
 
 def loaded() -> list[str]:
     """Paths of the shared libraries in this process."""
-    found: list[str] = []
+    paths: list[str] = []
 
     class Information(ctypes.Structure):
         _fields_ = (("address", ctypes.c_void_p), ("name", ctypes.c_char_p))
@@ -129,8 +129,8 @@ def loaded() -> list[str]:
     @ctypes.CFUNCTYPE(ctypes.c_int, ctypes.POINTER(Information), ctypes.c_size_t, ctypes.c_void_p)
     def each(information, size, data):  # type: ignore[no-untyped-def]
         if information.contents.name:
-            found.append(os.fsdecode(information.contents.name))
+            paths.append(os.fsdecode(information.contents.name))
         return 0
 
     libc.dl_iterate_phdr(each, None)
-    return found
+    return paths

@@ -41,6 +41,9 @@ MAX_USED = 1 << 53
 MAX_TEXT = 16_000
 MAX_CODE_BYTES = 1 << 20
 
+KINDS = dict.fromkeys((errno.ENOSPC, errno.EFBIG, errno.EDQUOT), "files")
+KINDS |= {errno.EMFILE: "descriptors", errno.ENFILE: "descriptors", errno.EAGAIN: "processes"}
+"""The limit that an error of the system reports."""
 _REHEARSED = 32
 """Steps: more than the interpreter needs to adapt its code."""
 
@@ -331,12 +334,7 @@ def part_reader(space: dict[str, Any], fixed: list[int] | None, as_lists: bool) 
         return lambda body, at: row([item(body, at) for _ in range(take_count(body, at))])
     if kind == "OneOf":
         choices = [part_reader(part, None, as_lists) for part in space["spaces"]]
-
-        def one_of(body: Any, at: Any) -> Any:
-            index = take_count(body, at)
-            return row((index, choices[index](body, at)))
-
-        return one_of
+        return lambda body, at: row((index := take_count(body, at), choices[index](body, at)))
     if kind == "Graph":
         return graph_reader(space, as_lists)
     shape, dtype = array_of(space)
@@ -390,16 +388,15 @@ def take_array(body: Any, at: Any, shape: tuple[int, ...], dtype: Any, as_lists:
     start = at[0]
     count = math.prod(shape)
     at[0] = start + count * dtype.itemsize
-    # A copy: what stands anywhere in the buffer may not be aligned.
+    # A copy, since a part in the middle of the buffer may not be aligned.
     array = np.frombuffer(body, dtype, count, start).reshape(shape).copy()
     return array.tolist() if as_lists else array
 
 
 def read_text(body: Any, at: Any) -> str:
-    start = at[0] + 4
-    end = start + int.from_bytes(body[at[0] : start], "little")
-    at[0] = end
-    return str(body[start:end], "utf-8", "surrogatepass")
+    length = take_count(body, at)
+    at[0] += length
+    return str(body[at[0] - length : at[0]], "utf-8", "surrogatepass")
 
 
 # Actions.
@@ -422,10 +419,7 @@ def encoded(action: Any) -> bytes:
     if kind is int and -(1 << 63) <= action < 1 << 63:
         return struct.pack("<IBxxxq", 8, INT, action)
     if kind is np.ndarray and action.dtype.kind in "biuf" and action.itemsize <= 8:
-        if action.nbytes > action_bytes:
-            raise TooLargeError(
-                f"the action has {action.nbytes:,} bytes; {action_bytes:,} are the limit", action.nbytes
-            )
+        check_size(action.nbytes)
         if action.size > action_bytes // VALUE_BYTES or not action.size:
             check_values(numbers_of(action))
         data = array_data(action)
@@ -438,10 +432,14 @@ def encoded(action: Any) -> bytes:
         return struct.pack(f"<IBxxx{len(action)}d", 8 * len(action), FLOATS, *action)
     out = bytearray()
     n = pack(action, out, 0)
-    if len(out) > action_bytes:
-        raise TooLargeError(f"the action has {len(out):,} bytes; {action_bytes:,} are the limit", len(out))
+    check_size(len(out))
     check_values(n)
     return REPLY_HEADER.pack(len(out), GENERIC) + bytes(out)
+
+
+def check_size(n: int) -> None:
+    if n > action_bytes:
+        raise TooLargeError(f"the action has {n:,} bytes; {action_bytes:,} are the limit", n)
 
 
 def check_values(n: int) -> None:
@@ -473,7 +471,7 @@ def array_data(array: Any) -> bytes:
 
 
 def pack(value: Any, out: bytearray, depth: int) -> int:
-    """Appends `value` as msgpack; what has no form there goes as the name of its type. How many values it holds."""
+    """Appends `value` as msgpack, or its type's name where it has no form there. Returns how many values it holds."""
     n = 1
     if depth > MAX_ACTION_DEPTH:
         raise ValueError(f"the action nests deeper than {MAX_ACTION_DEPTH}")
@@ -537,7 +535,7 @@ def reply(tag: int, payload: bytes) -> None:
 
 
 def reply_failure(stage: str, error: BaseException) -> None:
-    """Tells what the policy's own code raised. Its text is the policy's to forge; it names its own failure only."""
+    """Reports an exception of the policy's own code. The policy may forge its text; it names its own failure only."""
     kind, text, message, missing = None, "", "an exception that cannot be shown", None
     # A hostile exception may raise when it is read; then the parts read so far are reported.
     with contextlib.suppress(BaseException):
@@ -569,25 +567,19 @@ def sendable(text: str) -> str:
 
 def kind_of(error: BaseException | None) -> str | None:
     """Which limit an exception tells of, if any."""
-    seen = 0
-    while error is not None and seen < 10:
+    for _ in range(10):
+        if error is None:
+            break
         if type(error) is TooLargeError:
             return "action"
         if isinstance(error, MemoryError):
             return "memory"
-        if isinstance(error, OSError):
-            if error.errno == errno.ENOSPC and no_file_left():
-                return "inodes"
-            if error.errno in (errno.ENOSPC, errno.EFBIG, errno.EDQUOT):
-                return "files"
-            if error.errno in (errno.EMFILE, errno.ENFILE):
-                return "descriptors"
-            if error.errno == errno.EAGAIN:
-                return "processes"
+        if isinstance(error, OSError) and error.errno in KINDS:
+            full = error.errno == errno.ENOSPC and no_file_left()
+            return "inodes" if full else KINDS[error.errno]
         if isinstance(error, RuntimeError) and "start new thread" in str(error):
             return "processes"
         error = error.__cause__ or (None if error.__suppress_context__ else error.__context__)
-        seen += 1
     return None
 
 

@@ -22,15 +22,8 @@ import numpy as np
 
 MODULE = "evopolicygym.policy"
 POLICY_ABI_VERSION = "policy/v2"
-DTYPES = frozenset(
-    (
-        "bool",
-        "float16",
-        "float32",
-        "float64",
-        *(f"{sign}int{n}" for sign in ("", "u") for n in (8, 16, 32, 64)),
-    )
-)
+DTYPES = {"bool", "float16", "float32", "float64"}
+DTYPES |= {f"{sign}int{n}" for sign in ("", "u") for n in (8, 16, 32, 64)}
 MAX_DEPTH = 32
 MAX_NODES = 65_536
 
@@ -77,7 +70,7 @@ class PolicyContext:
 
 
 class Policy(Protocol):
-    """What `make_policy` returns."""
+    """The result of `make_policy`."""
 
     def act(self, observation: Any) -> Any: ...
 
@@ -89,11 +82,12 @@ def copy_policy_value(value: Any) -> Any:
 
 def converted(value: Any, of_tensor: Callable[[TensorValue], Any]) -> Any:
     """A copy with `of_tensor` applied to tensors. Raises TypeError or ValueError for what is no PolicyValue."""
-    left = [MAX_NODES]
+    n_parts = 0
 
     def copy(value: Any, depth: int) -> Any:
-        left[0] -= 1
-        if left[0] < 0 or depth > MAX_DEPTH:
+        nonlocal n_parts
+        n_parts += 1
+        if n_parts > MAX_NODES or depth > MAX_DEPTH:
             raise ValueError(f"a value of more than {MAX_NODES:,} parts, or nested deeper than {MAX_DEPTH}")
         kind = type(value)
         if value is None or kind in (bool, str, bytes):
@@ -195,13 +189,8 @@ class Finder:
 
 
 EXPORTED = (
-    "PolicyContext",
-    "PolicyValue",
-    "PolicyScalar",
-    "TensorValue",
-    "Policy",
-    "copy_policy_value",
-    "POLICY_ABI_VERSION",
+    *("PolicyContext", "PolicyValue", "PolicyScalar", "TensorValue", "Policy"),
+    *("copy_policy_value", "POLICY_ABI_VERSION"),
 )
 for _name in EXPORTED:
     if isinstance(globals()[_name], type | types.FunctionType):

@@ -65,10 +65,10 @@ player: Any = None
 scan_json = vars(json.JSONDecoder())["scan_once"]
 
 
-def check(result: int, what: str) -> int:
+def check(result: int, call: str) -> int:
     if result < 0:
         number = ctypes.get_errno()
-        raise OSError(number, f"{what}: {os.strerror(number)}")
+        raise OSError(number, f"{call}: {os.strerror(number)}")
     return result
 
 
@@ -218,8 +218,8 @@ def zygote(control: int, namespaces: bool, then: Callable[[int], None]) -> NoRet
     with the same arguments. How a policy ended lies in a page that children do not inherit, from where it is sent.
 
     A request of one byte asks how a process ended (its pidfd, a socket for the answer), one of two asks for a process
-    (the socket that is returned) or, beginning with `q`, for the end. A closed socket asks for the end too: the kernel's
-    kill of a child whose parent dies can come before the child has asked for it.
+    (the socket that is returned) or, beginning with `q`, for the end. A closed socket asks for the end too: the
+    kernel's kill of a child whose parent dies can come before the child has asked for it.
     """
     page = unshared_page()
     how, usage = ctypes.c_void_p(page), ctypes.c_void_p(page + SIGINFO_BYTES)
@@ -259,7 +259,7 @@ def zygote(control: int, namespaces: bool, then: Callable[[int], None]) -> NoRet
         )
     )
     until_two_bytes = map(operator.call, itertools.repeat(functools.partial(iter, ends, 2)))
-    # To look for what is not among the answers is to ask for all of them.
+    # The search for an object that is not among the answers asks for all of them.
     gone_through = map(operator.contains, until_two_bytes, itertools.repeat(object()))
     circle = (
         functools.partial(next, map(operator.not_, gone_through)),
@@ -325,8 +325,8 @@ def policy_process(config: dict[str, Any], worker: int, streams: tuple[Any, Any]
         if home is not None:
             limit_home(home, init["home_bytes"], init["home_inodes"])
         else:
-            os.makedirs(init["home"] + "/tmp", exist_ok=True)
-            os.makedirs(init["home"] + "/system", exist_ok=True)
+            for folder in ("/tmp", "/system"):
+                os.makedirs(init["home"] + folder, exist_ok=True)
             player.live_in(init["home"])
         write_bundle(init, memoryview(body)[json_length:])
         seal(config, init)
@@ -369,7 +369,7 @@ def private_pipe(path: str) -> tuple[int, int]:
 
 
 def output_streams() -> tuple[Any, Any]:
-    """Text on 1 and 2 that is written line by line: what was printed before a policy is killed is kept.
+    """Text on 1 and 2 that is written line by line, so that lines printed before a policy is killed are kept.
 
     Made while both are a pipe, as they will be in the policies' processes: a stream remembers whether its file has a
     position.
@@ -378,17 +378,14 @@ def output_streams() -> tuple[Any, Any]:
     before = os.dup(1), os.dup(2)
     for fd in (1, 2):
         os.dup2(pipe[1], fd)
-    streams = output_stream(1), output_stream(2)
+    raw = [io.BufferedWriter(io.FileIO(fd, "w", closefd=False)) for fd in (1, 2)]
+    options: dict[str, Any] = {"encoding": "utf-8", "errors": "backslashreplace", "line_buffering": True}
+    streams = io.TextIOWrapper(raw[0], **options), io.TextIOWrapper(raw[1], **options)
     for fd, own in zip((1, 2), before, strict=True):
         os.dup2(own, fd)
     for fd in (*pipe, *before):
         os.close(fd)
     return streams
-
-
-def output_stream(fd: int) -> io.TextIOWrapper:
-    raw = io.BufferedWriter(io.FileIO(fd, "w", closefd=False))
-    return io.TextIOWrapper(raw, encoding="utf-8", errors="backslashreplace", line_buffering=True)
 
 
 def mount_home(home: str, own_tmp: bool) -> None:
