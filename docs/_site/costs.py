@@ -7,7 +7,6 @@ measures those that have no times. `python docs/_site/families.py` then writes t
 
 from __future__ import annotations
 
-import asyncio
 import subprocess
 import sys
 
@@ -23,7 +22,7 @@ def main(ids: list[str]) -> None:
     divided = installs.divided(ids)
     with bare_loop(()) as bare:
         for env_id in divided.pop(sys.executable, []):
-            cost = asyncio.run(in_a_slot(env_id, (), bare))
+            cost = in_a_slot(env_id, (), bare)
             print(env_id, *cost.times(), cost.fault, flush=True)
             if not cost.fault:
                 row = f"| `{env_id}` | {' | '.join(cost.times())} |"

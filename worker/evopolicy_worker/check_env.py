@@ -8,9 +8,9 @@ import os
 import statistics
 import subprocess
 import sys
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import IO, Annotated
+from typing import Annotated
 
 import msgspec
 import typer
@@ -31,27 +31,35 @@ from evopolicy_worker.environments.checks.conformance import SEEDS, CheckResult
 from evopolicy_worker.environments.checks.costs import Stretch, literal
 from evopolicy_worker.environments.interface.actions import compile_actions
 from evopolicy_worker.environments.interface.settings import use_browser
-from evopolicy_worker.sandbox import available_tiers
 from evopolicy_worker.slots.slot import Slot
+from evopolicy_worker.slots.tiers import available_tiers
 
+Browser = Annotated[
+    Path | None,
+    typer.Option(
+        exists=True,
+        dir_okay=False,
+        help="Chromium's program, for environments that are web pages; default: the machine's own.",
+    ),
+]
+"""The option of all commands of a worker."""
 HASH_SEEDS = ("0", "1")
 MOST_MEMORY_MB = 600
 """A slot whose processes need more is a fault: workers have a slot for each core."""
-COLUMNS = (
-    "environment",
-    "limit",
-    "played",
-    "ends",
-    "same episode",
-    "drawn",
-    "CPU µs, bare",
-    "CPU µs, slot",
-    "bytes a step",
-    "MB",
-    "verdict",
-)
-TIMES = slice(COLUMNS.index("CPU µs, bare"), COLUMNS.index("bytes a step"))
+_PLAYED = ("environment", "limit", "played", "ends", "same episode", "drawn")
+COLUMNS = (*_PLAYED, "CPU µs, bare", "CPU µs, slot", "bytes a step", "MB", "verdict")
+TIMES = slice(len(_PLAYED), len(_PLAYED) + 2)
 """The cells of processor time, which have a table of their own on a page: few environments are measured."""
+TURNS = 3
+LEAST_S = 2e-3
+"""Processor time of an episode's start varies by about this."""
+_POLICY = """
+class Policy:
+    def __init__(self, *spaces): pass
+    def reset(self, episode_index): self.actions = iter(ACTIONS)
+    def act(self, obs): return next(self.actions)
+
+ACTIONS = """
 
 
 class InASlot(msgspec.Struct, frozen=True, kw_only=True):
@@ -59,11 +67,11 @@ class InASlot(msgspec.Struct, frozen=True, kw_only=True):
     it."""
 
     bare_us: float = 0.0
-    """Processor time of a step of the library's environment without the adapter, and without accelerations, µs; the
-    median of `TURNS`. 0: not measured, as of an episode of one step."""
+    """Processor time of a step of the library's environment, without adapter and accelerations, µs; the median of
+    `TURNS`. 0: not measured, as of an episode of one step."""
     slot_us: float = 0.0
-    """Processor time of the same steps in the slot, with its policy, recording and accelerations, in turns, µs; 0: not
-    measured, as where they take less than `LEAST_S` together."""
+    """The same for the slot, with its policy, recording and accelerations. 0 also where all steps together take less
+    than `LEAST_S`."""
     busy: bool = False
     """Whether the machine had more to do than it has cores."""
     memory_mb: int = 0
@@ -89,111 +97,99 @@ class Checked(msgspec.Struct, frozen=True):
 
     @property
     def verdict(self) -> str:
-        memory = self.slot.memory_mb
-        large = (
-            f"its slot needs {memory:,} MB; {MOST_MEMORY_MB} are the limit" if memory > MOST_MEMORY_MB else ""
-        )
-        wrong = (self.here.verdict(self.there), self.slot.fault, large)
+        wrong = [self.here.verdict(self.there), self.slot.fault]
+        if self.slot.memory_mb > MOST_MEMORY_MB:
+            wrong.append(f"its slot needs {self.slot.memory_mb:,} MB; {MOST_MEMORY_MB} are the limit")
         return "; ".join(each for each in wrong if each not in ("", "ok")) or "ok"
 
     def cells(self) -> tuple[str, ...]:
         """The table row, in the order of `COLUMNS`."""
         here = self.here
-        same = "rebuilt" if here.rebuilt else "reused"
-        return (
-            here.env,
-            f"{here.limit:,}",
-            f"{here.steps:,}",
-            here.ended,
-            same if here.fresh and here.reused and here.digest == self.there.digest else "no",
-            here.rendered,
-            *self.slot.times(),
-            f"{here.step_bytes:,}",
-            f"{self.slot.memory_mb or here.memory_mb:,}",
-            self.verdict,
-        )
+        same = here.fresh and here.reused and here.digest == self.there.digest
+        how = "no" if not same else "rebuilt" if here.rebuilt else "reused"
+        memory = f"{self.slot.memory_mb or here.memory_mb:,}"
+        played = (here.env, f"{here.limit:,}", f"{here.steps:,}", here.ended, how, here.rendered)
+        return (*played, *self.slot.times(), f"{here.step_bytes:,}", memory, self.verdict)
 
 
-def check(env_ids: Sequence[str], steps: int, definitions: Iterable[Entry]) -> Iterator[Checked]:
+def check(env_ids: Sequence[str], steps: int, definitions: tuple[Entry, ...]) -> Iterator[Checked]:
     """Yields each environment when both processes and a slot have played it. Raises WorkerError when one of the
     processes ends too early."""
-    definitions = tuple(definitions)
     variables = environments.process_environment(render=True)
     with contextlib.ExitStack() as stack:
-        processes = [
-            stack.enter_context(
-                _program(
-                    "conformance", str(steps), *env_ids, definitions=definitions, variables=variables | hashes
-                )
-            )
-            for hashes in ({"PYTHONHASHSEED": seed} for seed in HASH_SEEDS)
+        programs = [
+            _program(definitions, variables | {"PYTHONHASHSEED": seed}, "conformance", str(steps), *env_ids)
+            for seed in HASH_SEEDS
         ]
+        processes = [stack.enter_context(program) for program in programs]
         bare = stack.enter_context(bare_loop(definitions))
         for env_id in env_ids:
-            here, there = (_next(answers, env_id) for _, answers in processes)
+            lines = [answer() for answer in processes]
+            if not all(lines):
+                raise WorkerError(f"the process that plays {env_id} has ended")
+            here, there = (msgspec.json.decode(line, type=CheckResult) for line in lines)
             own = tuple(each for each in definitions if each.id == env_id)
-            slot = InASlot() if here.faults else asyncio.run(in_a_slot(env_id, own, bare))
+            slot = InASlot() if here.faults else in_a_slot(env_id, own, bare)
             yield Checked(here, there, slot)
 
 
 @contextlib.contextmanager
 def _program(
-    name: str, *arguments: str, definitions: Sequence[Entry], variables: Mapping[str, str]
-) -> Iterator[tuple[IO[bytes], IO[bytes]]]:
-    """A running program of `environments.checks`: its standard input, which has got the definitions, and its standard
-    output."""
+    definitions: tuple[Entry, ...], variables: dict[str, str], name: str, *arguments: str
+) -> Iterator[Callable[..., bytes]]:
+    """A running program of `environments.checks`: sends it a line, if one is given, and returns its next line, which is
+    empty once it has ended."""
     command = [sys.executable, "-P", "-m", f"evopolicy_worker.environments.checks.{name}", *arguments]
     # In a folder that is removed even if the process is killed.
     with scratch_folder("check") as scratch:
         environment = os.environ | variables | {"TMPDIR": str(scratch)}
         process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=environment)
-        assert process.stdin is not None
-        assert process.stdout is not None
+        asked, answers = process.stdin, process.stdout
+        assert asked is not None
+        assert answers is not None
+
+        def answer(line: bytes = b"") -> bytes:
+            with contextlib.suppress(BrokenPipeError):
+                asked.write(line)
+                asked.flush()
+            return answers.readline()
+
         try:
-            process.stdin.write(msgspec.json.encode(definitions) + b"\n")
-            process.stdin.flush()
-            yield process.stdin, process.stdout
+            asked.write(msgspec.json.encode(definitions) + b"\n")
+            asked.flush()
+            yield answer
         finally:
             process.kill()
             process.wait()
-            process.stdout.close()
+            answers.close()
             with contextlib.suppress(BrokenPipeError):  # what was not read is still held
-                process.stdin.close()
-
-
-TURNS = 3
-LEAST_S = 2e-3
-"""Processor time of an episode's start varies by about this."""
-_POLICY = """
-class Policy:
-    def __init__(self, *spaces): pass
-    def reset(self, episode_index): self.left = iter(ACTIONS)
-    def act(self, obs): return next(self.left)
-
-ACTIONS = """
+                asked.close()
 
 
 @contextlib.contextmanager
 def bare_loop(definitions: tuple[Entry, ...]) -> Iterator[Callable[[str], Stretch]]:
     """A process that plays the stretch of an environment without a slot, at each call; see `costs`."""
     variables = environments.process_environment(accelerations=False)
-    with _program("costs", definitions=definitions, variables=variables) as (asked, answers):
+    with _program(definitions, variables, "costs") as answer:
 
         def play(env_id: str) -> Stretch:
             # An environment that has ended the process costs later ones their bare times, not their checks.
-            with contextlib.suppress(BrokenPipeError):
-                asked.write(f"{env_id}\n".encode())
-                asked.flush()
-            line = answers.readline()
+            line = answer(f"{env_id}\n".encode())
             return msgspec.json.decode(line, type=Stretch) if line else Stretch(fault="its process ended")
 
         yield play
 
 
-async def in_a_slot(env_id: str, definitions: tuple[Entry, ...], bare: Callable[[str], Stretch]) -> InASlot:
+def in_a_slot(env_id: str, definitions: tuple[Entry, ...], bare: Callable[[str], Stretch]) -> InASlot:
     """Plays the begin of one train episode bare, and in a slot of its own once for one step and once for all its steps:
     the difference is of steps alone."""
     tier = available_tiers(unsandboxed=True)[0]
+    return asyncio.run(_in_a_slot(env_id, tier, definitions, bare))
+
+
+async def _in_a_slot(
+    env_id: str, tier: Tier, definitions: tuple[Entry, ...], bare: Callable[[str], Stretch]
+) -> InASlot:
     with scratch_folder("check") as scratch:
         slot = Slot(None, tier, scratch / "slot", definitions=definitions)
         bundle = scratch / "bundle"
@@ -209,8 +205,8 @@ async def in_a_slot(env_id: str, definitions: tuple[Entry, ...], bare: Callable[
             for turn in range(TURNS if n > 1 else 1):
                 if turn:
                     bare_s.append(bare(env_id).cpu_s)
-                short = await _played(slot, _job(description, tier, 1), bundle)
-                slot_s.append(await _played(slot, _job(description, tier, max(n, 1)), bundle) - short)
+                short, whole = [await _played(slot, description, tier, k, bundle) for k in (1, max(n, 1))]
+                slot_s.append(whole - short)
             slot_each = statistics.median(slot_s)
             return InASlot(
                 bare_us=round(1e6 * statistics.median(bare_s) / n, 2) if n else 0.0,
@@ -225,16 +221,10 @@ async def in_a_slot(env_id: str, definitions: tuple[Entry, ...], bare: Callable[
             await slot.close()
 
 
-async def _played(slot: Slot, job: Job, bundle: Path) -> float:
-    """Processor time of all of the slot's processes for an episode, seconds."""
-    before = slot.cpu_s()
-    (outcome,) = await slot.play(job, bundle, lambda episodes, steps: None)
-    if outcome.failure is not None:
-        raise WorkerError(outcome.failure.message[:200])
-    return slot.cpu_s() - before + outcome.policy_cpu_s
-
-
-def _job(description: EnvironmentDescription, tier: Tier, steps: int) -> Job:
+async def _played(
+    slot: Slot, description: EnvironmentDescription, tier: Tier, steps: int, bundle: Path
+) -> float:
+    """Processor time of all of the slot's processes for an episode of at most so many steps, seconds."""
     meta = {
         "env": description.env,
         "submit_index": 0,
@@ -243,7 +233,7 @@ def _job(description: EnvironmentDescription, tier: Tier, steps: int) -> Job:
         "max_episode_steps": description.max_episode_steps,
     }
     spec = EpisodeSpec(index=0, episode_index=0, case=Case(seed=SEEDS[0]), policy_seed=bytes(16))
-    return Job(
+    job = Job(
         job_id="check",
         env=description.env,
         bundle="check",
@@ -253,13 +243,11 @@ def _job(description: EnvironmentDescription, tier: Tier, steps: int) -> Job:
         render=True,
         max_steps=steps,
     )
-
-
-def _next(answers: IO[bytes], env_id: str) -> CheckResult:
-    line = answers.readline()
-    if not line:
-        raise WorkerError(f"the process that plays {env_id} has ended")
-    return msgspec.json.decode(line, type=CheckResult)
+    before = slot.cpu_s()
+    (outcome,) = await slot.play(job, bundle, lambda episodes, steps: None)
+    if outcome.failure is not None:
+        raise WorkerError(outcome.failure.message[:200])
+    return slot.cpu_s() - before + outcome.policy_cpu_s
 
 
 def command(
@@ -267,12 +255,7 @@ def command(
         list[str], typer.Argument(help="Environments, as for --env of a worker: ids, suites, globs, files.")
     ],
     steps: Annotated[int, typer.Option(min=1, help="Greatest number of steps of an episode.")] = 600,
-    browser: Annotated[
-        Path | None,
-        typer.Option(
-            exists=True, dir_okay=False, help="Path of Chromium, for environments that are web pages."
-        ),
-    ] = None,
+    browser: Browser = None,
     results: Annotated[
         Path | None,
         typer.Option(help="File for results, one line of JSON each; results in it are not measured again."),

@@ -10,7 +10,7 @@ import secrets
 import signal
 import socket
 import sys
-from collections.abc import AsyncIterator, Callable, Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Annotated, cast
@@ -34,15 +34,15 @@ from evopolicy_common.processes.scratch import scratch_folder
 from evopolicy_common.terminal import say, say_json
 from evopolicy_common.wire import credentials, keys, transport
 from evopolicy_common.wire.credentials import read_ready
-from evopolicy_worker import check_env, descriptions, environments, setup
-from evopolicy_worker.capabilities import Capabilities, log_missing
+from evopolicy_worker import capabilities, check_env, environments, setup
+from evopolicy_worker.capabilities import Capabilities, describe_all, log_missing
+from evopolicy_worker.doctor import best_tier, examine
 from evopolicy_worker.environments.interface.calls import USUAL, Limits
 from evopolicy_worker.environments.interface.fingerprint import fingerprint
 from evopolicy_worker.environments.interface.settings import use_browser
-from evopolicy_worker.sandbox import SANDBOXED, available_tiers, why_not
-from evopolicy_worker.sandbox.doctor import best_tier, examine
 from evopolicy_worker.slots.cores import Cores
 from evopolicy_worker.slots.slot import Slot
+from evopolicy_worker.slots.tiers import SANDBOXED, available_tiers, why_not
 from evopolicy_worker.supervisor import MAX_PREPARED, Options, Supervisor
 
 app = App(add_completion=True)
@@ -112,14 +112,7 @@ def work(
             help="Sandbox tier without which the worker does not start; it offers no other.",
         ),
     ] = None,
-    browser: Annotated[
-        Path | None,
-        typer.Option(
-            exists=True,
-            dir_okay=False,
-            help="Path of Chromium, for environments that are web pages; default: found on this machine.",
-        ),
-    ] = None,
+    browser: check_env.Browser = None,
     env_timeout: Annotated[
         float,
         typer.Option(
@@ -162,7 +155,7 @@ def work(
 
         find = partial(credentials.find, "worker", tuple(connect or ()), credentials_file)
         # Wrong credentials are reported at once. With --ready-file they do not exist yet.
-        found = None if ready_file else find()
+        known = None if ready_file else find()
         needed = cast("tuple[Tier, ...]", tuple(need_tier or ()))
         if len(needed) == 1 and needed[0] in SANDBOXED:
             # The first slot tests the tier when it starts.
@@ -181,9 +174,9 @@ def work(
                 raise _refused(tier, missing.get(tier), unsandboxed=unsandboxed)
         limits = Limits(call_s=env_timeout, memory_bytes=env_memory << 20)
         with scratch_folder("worker") as scratch:
-            made = _Slots(scratch, slots, packages, wanted, limits)
+            own = (name, wanted, tiers, missing, slots, packages, limits, scratch, grace)
             try:
-                asyncio.run(_run(found, find, ready_file, name, wanted, tiers, missing, made, grace))
+                asyncio.run(_run(find, known, ready_file, *own))
             except SandboxError as error:
                 if not needed:
                     raise
@@ -200,7 +193,7 @@ def doctor(
 
     Exit code 0 if a sandboxed tier works, 1 if only `none` does.
     """
-    checks = examine()
+    checks = tuple(examine())
     best = best_tier(checks)
     if as_json:
         say_json({"tier": best, "checks": checks})
@@ -232,17 +225,17 @@ def _other_tier(tiers: tuple[Tier, ...]) -> str:
     return "--tier none plays policies unconfined, which run.json then says"
 
 
-def default_name(found: credentials.Credentials) -> str:
+def default_name(own: credentials.Credentials) -> str:
     """The name that the machine's certificate was issued for; without one, the host's name with a random part.
 
     A second worker with the same certificate on this machine also gets a random part, so that names are unique.
     """
-    certified = found.user.partition("/")[2]
+    certified = own.user.partition("/")[2]
     if not certified:
         return f"{socket.gethostname().split('.')[0][:40] or 'worker'}-{secrets.token_hex(3)}"
-    assert found.tls is not None
+    assert own.tls is not None
     # Never closed, so that the lock is held for the life of this process.
-    fd = os.open(found.tls.certificate, os.O_RDONLY | os.O_CLOEXEC)
+    fd = os.open(own.tls.certificate, os.O_RDONLY | os.O_CLOEXEC)
     try:
         fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except OSError:  # held by another worker, or a file system without locks
@@ -251,134 +244,115 @@ def default_name(found: credentials.Credentials) -> str:
     return certified
 
 
-class _Slots:
-    """Makes the slots of this worker, each on a core."""
-
-    def __init__(
-        self, scratch: Path, n: int | None, packages: tuple[str, ...], env_ids: list[str], limits: Limits
-    ) -> None:
-        """`packages`: those that policies may import besides numpy. Environments that do not ship are defined in the
-        processes that play them."""
-        self.cores = Cores()
-        notify_of_many_slots(n or 0)
-        self.scratch = scratch
-        self.taken = [self.cores.take() for _ in range(n or self.cores.count)]
-        self.importable = policy_versions(packages)
-        foreign = tuple(catalogue.entry(env_id) for env_id in env_ids if not catalogue.is_shipped(env_id))
-        self._slot = partial(Slot, allowed_packages=("numpy", *packages), definitions=foreign, limits=limits)
-
-    def make(self, index: int, tier: Tier) -> Slot:
-        return self._slot(self.taken[index], tier, self.scratch / f"slot-{index}")
-
-    @contextlib.asynccontextmanager
-    async def spare(self, name: str, tier: Tier) -> AsyncIterator[Slot]:
-        """A slot for a while, on any core."""
-        slot = self._slot(None, tier, self.scratch / f"slot-{name}")
-        try:
-            yield slot
-        finally:
-            await slot.close()
-
-
 async def _run(
-    found: credentials.Credentials | None,
     find: Callable[[], credentials.Credentials],
+    joining: credentials.Credentials | None,
     ready_file: Path | None,
     name: str | None,
     env_ids: list[str],
     tiers: tuple[Tier, ...],
     missing: dict[Tier, str],
-    slots: _Slots,
+    n_slots: int | None,
+    packages: tuple[str, ...],
+    limits: Limits,
+    scratch: Path,
     grace_s: float,
 ) -> None:
-    first = slots.make(0, tiers[0])
-    kept = [first]
+    """`joining`: the credentials; None where they do not exist before `ready_file` is written. `packages`: those that
+    policies may import besides numpy."""
+    cores = Cores()
+    notify_of_many_slots(n_slots or 0)
+    taken = [cores.take() for _ in range(n_slots or len(cores.allowed))]
+    importable = policy_versions(packages)
+    # Environments that do not ship are defined in the processes that play them.
+    foreign = tuple(catalogue.entry(env_id) for env_id in env_ids if not catalogue.is_shipped(env_id))
+
+    def new_slot(core: int | None, slot: object, tier: Tier) -> Slot:
+        own = scratch / f"slot-{slot}"
+        return Slot(core, tier, own, ("numpy", *packages), definitions=foreign, limits=limits)
+
+    first = new_slot(taken[0], 0, tiers[0])
+    kept = {(0, tiers[0]): first}
 
     def make_slot(index: int, tier: Tier) -> Slot:
-        return kept.pop() if kept and (index, tier) == (0, tiers[0]) else slots.make(index, tier)
+        return kept.pop((index, tier), None) or new_slot(taken[index], index, tier)
 
-    own = fingerprint()
-    cache = descriptions.Cache(own.code_version)
-    own = msgspec.structs.replace(own, packages={**own.packages, **slots.importable})
-
-    def importing(found: Sequence[EnvironmentDescription]) -> tuple[EnvironmentDescription, ...]:
+    def importing(described: Sequence[EnvironmentDescription]) -> tuple[EnvironmentDescription, ...]:
         """With the packages that policies may import, on which their results depend in every environment."""
-        return tuple(
-            msgspec.structs.replace(each, packages={**each.packages, **slots.importable}) for each in found
-        )
+        return tuple(msgspec.structs.replace(each, packages=each.packages | importable) for each in described)
 
     async def describe(wanted: Sequence[str]) -> tuple[tuple[EnvironmentDescription, ...], dict[str, str]]:
-        async with slots.spare("descriptions", tiers[0]) as slot:
-            made, failed = await descriptions.describe_all(wanted, slot, cache)
+        slot = new_slot(None, "descriptions", tiers[0])
+        try:
+            made, failed = await describe_all(wanted, slot, cache)
+        finally:
+            await slot.close()
         return importing(made), failed
 
     async def probe(tier: Tier) -> None:
-        async with slots.spare("probe", tier) as slot:
+        slot = new_slot(None, "probe", tier)
+        try:
             await slot.start()
-
-    try:
-        known, now, later = descriptions.sorted_out(env_ids, cache)
-        made, failed = await descriptions.describe_all(now, first, cache)
-        known += made
-        if len(env_ids) > MAX_PREPARED:
-            await first.close()
-        if found is None:
-            assert ready_file is not None
-            ready = await read_ready(ready_file, asyncio.get_running_loop().create_future())
-            found = credentials.find("worker", (), Path(ready.credentials["worker"]))
-        capabilities = Capabilities(
-            tiers,
-            importing(sorted(known, key=lambda each: env_ids.index(each.env))),
-            missing_tiers=missing,
-            undescribed=later,
-            failed_environments=failed,
-            probe=probe,
-            describe=describe,
-        )
-        options = Options(
-            name=name or default_name(found),
-            slots=len(slots.taken),
-            fingerprint=own,
-            host=socket.gethostname(),
-            boot_id=host.boot_id(),
-            scratch=slots.scratch,
-            grace_s=grace_s,
-        )
-        if not options.boot_id:
-            log.warning("this worker gets no hidden episodes", why=host.NO_BOOT_ID)
-        log.info("waiting for the coordinator", endpoints=found.endpoints)
-        link = transport.connect(found, timeout_s=None, read_again=None if ready_file else find)
-        with contextlib.suppress(asyncio.CancelledError):
-            await _serve(link, lambda link: Supervisor(link, options, capabilities, make_slot))
-    finally:
-        for slot in kept:
+        finally:
             await slot.close()
-        slots.cores.close()
 
-
-async def _serve(
-    connecting: contextlib.AbstractAsyncContextManager[transport.Link],
-    supervise: Callable[[transport.Link], Supervisor],
-) -> None:
-    loop = asyncio.get_running_loop()
     main = asyncio.current_task()
     assert main is not None
     supervisor: Supervisor | None = None
 
     def stop() -> None:
         # A second signal, or one before the supervisor exists, ends the worker at once.
-        if supervisor is None or supervisor.draining:
+        if supervisor is None or supervisor.draining.is_set():
             main.cancel()
         else:
             log.info("draining; once more to stop at once")
             supervisor.drain()
 
-    for number in (signal.SIGTERM, signal.SIGINT):
-        loop.add_signal_handler(number, stop)
-    async with connecting as link:
-        supervisor = supervise(link)
-        await supervisor.run()
-        log.info("stopped", jobs_done=supervisor.jobs_done)
+    own = fingerprint()
+    cache = capabilities.Cache(own.code_version)
+    try:
+        known, now, later = capabilities.sorted_out(env_ids, cache)
+        made, failed = await describe_all(now, first, cache)
+        known += made
+        if len(env_ids) > MAX_PREPARED:
+            await first.close()
+        if joining is None:
+            assert ready_file is not None
+            ready = await read_ready(ready_file, asyncio.get_running_loop().create_future())
+            joining = credentials.find("worker", (), Path(ready.credentials["worker"]))
+        able = Capabilities(
+            tiers,
+            importing(sorted(known, key=lambda each: env_ids.index(each.env))),
+            missing_tiers=missing,
+            undescribed=tuple(later),
+            failed_environments=failed,
+            probe=probe,
+            describe=describe,
+        )
+        options = Options(
+            name=name or default_name(joining),
+            slots=len(taken),
+            fingerprint=msgspec.structs.replace(own, packages=own.packages | importable),
+            host=socket.gethostname(),
+            boot_id=host.boot_id(),
+            scratch=scratch,
+            grace_s=grace_s,
+        )
+        if not options.boot_id:
+            log.warning("this worker gets no hidden episodes", why=host.NO_BOOT_ID)
+        log.info("waiting for the coordinator", endpoints=joining.endpoints)
+        connecting = transport.connect(joining, timeout_s=None, read_again=None if ready_file else find)
+        with contextlib.suppress(asyncio.CancelledError):
+            for number in (signal.SIGTERM, signal.SIGINT):
+                asyncio.get_running_loop().add_signal_handler(number, stop)
+            async with connecting as link:
+                supervisor = Supervisor(link, options, able, make_slot)
+                await supervisor.run()
+                log.info("stopped", jobs_done=supervisor.jobs_done)
+    finally:
+        for slot in kept.values():
+            await slot.close()
+        cores.close()
 
 
 def main() -> None:

@@ -22,49 +22,13 @@ is reported."""
 FAILED_PAUSE_S = 0.25
 
 
-class HeldLeases:
-    """The leases that this worker holds. The event loop changes them, and the heartbeat thread reads them."""
-
-    def __init__(self) -> None:
-        self._lock = threading.Lock()
-        self._held: dict[str, HeldLease] = {}
-        # Larger than any number of an earlier process of this worker.
-        self._settled = time.time_ns() // 1_000_000
-
-    def put(self, lease: HeldLease) -> None:
-        """Adds a lease, or updates its progress; reported from the next heartbeat on."""
-        with self._lock:
-            self._held[lease.lease_id] = lease
-
-    def drop(self, lease_id: str) -> None:
-        """Removes a lease from the heartbeats."""
-        with self._lock:
-            self._held.pop(lease_id, None)
-
-    def settle(self, serial: int) -> None:
-        """Marks the poll with this number and all before it as finished: their leases have been put here."""
-        with self._lock:
-            self._settled = serial
-
-    @property
-    def settled(self) -> int:
-        """Number of the last finished poll."""
-        with self._lock:
-            return self._settled
-
-    def snapshot(self) -> tuple[tuple[HeldLease, ...], int]:
-        """Content of the next heartbeat: the leases, and the number of the last poll whose leases they include."""
-        with self._lock:
-            return tuple(self._held.values()), self._settled
-
-
 def clock() -> float:
     """Monotonic seconds, including the time the machine sleeps where the system has such a clock."""
     return time.clock_gettime(getattr(time, "CLOCK_BOOTTIME", time.CLOCK_MONOTONIC))
 
 
 class HeartbeatThread:
-    """Sends the held leases every `every_s` seconds and passes the replies to the event loop.
+    """Sends the held leases every `every_s` seconds and passes the replies to the event loop, which changes the leases.
 
     One heartbeat always waits at the coordinator, so that a cancellation arrives without delay.
     """
@@ -72,18 +36,20 @@ class HeartbeatThread:
     def __init__(
         self,
         link: Link,
-        cluster: str,
         worker: str,
-        held: HeldLeases,
         on_reply: Callable[[HeartbeatReply | Refused], None],
         on_failure: Callable[[BaseException], None],
     ) -> None:
         """Both callbacks run on the event loop that creates this object; `on_failure` when no further heartbeat can be
         sent."""
+        self.held: dict[str, HeldLease] = {}
+        """The leases that this worker holds, by id."""
+        self.settled = time.time_ns() // 1_000_000
+        """Number of the last finished poll: its leases, and those of all before, are or were in `held`. Begins above
+        any number of an earlier process of this worker."""
         self._link = link
-        self._key = keys.worker_key(cluster, "beat")
+        self._key = keys.worker_key(link.credentials.cluster, "beat")
         self._worker = worker
-        self._held = held
         self._on_reply = on_reply
         self._on_failure = on_failure
         self._loop = asyncio.get_running_loop()
@@ -109,10 +75,10 @@ class HeartbeatThread:
         self._stop.set()
 
     def _run(self) -> None:
-        try:
-            self._beat_until_stopped()
-        except Exception as error:
-            with contextlib.suppress(RuntimeError):  # the loop is closed: the worker is exiting
+        with contextlib.suppress(RuntimeError):  # the loop is closed: the worker is exiting
+            try:
+                self._beat_until_stopped()
+            except Exception as error:
                 self._loop.call_soon_threadsafe(self._on_failure, error)
 
     def _beat_until_stopped(self) -> None:
@@ -135,15 +101,13 @@ class HeartbeatThread:
             if time.monotonic() - last_sent < ANSWERED_PAUSE_S:
                 pause = max(pause, ANSWERED_PAUSE_S)
             if reply is not None:
-                try:
-                    self._loop.call_soon_threadsafe(self._on_reply, reply)
-                except RuntimeError:  # the loop is closed: the worker is exiting
-                    return
+                self._loop.call_soon_threadsafe(self._on_reply, reply)
 
     def _beat(self) -> HeartbeatReply | Refused | None:
         """Sends one heartbeat; None when it was not answered."""
         wait_s = self._every_s
-        held, settled = self._held.snapshot()
+        # In this order: the leases of that poll are there. The copy is one operation for other threads.
+        settled, held = self.settled, tuple(self.held.copy().values())
         message = Heartbeat(
             worker=self._worker, session=self._session, held=held, wait_s=wait_s, settled=settled
         )

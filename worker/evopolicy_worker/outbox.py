@@ -79,8 +79,8 @@ class Outbox:
         on_settled: Callable[[JobResult], None],
         more_follow: Callable[[], bool],
     ) -> None:
-        """`register_again` receives a session and its refusal, and tells whether it registered anew; `on_settled` each
-        result that left. `more_follow`: whether leased jobs wait for a slot; when none does any more, call `hurry`."""
+        """`register_again` receives a session and its refusal, and returns whether it registered anew; `on_settled`
+        each settled result. `more_follow`: whether leased jobs wait for a slot; call `hurry` after each change."""
         self._ask = ask
         self._worker = worker
         self._session = session
@@ -91,8 +91,9 @@ class Outbox:
         self._more_follow = more_follow
         self._hurried = asyncio.Event()
         self._filled = asyncio.Event()
-        self._emptied = asyncio.Event()
-        self._emptied.set()
+        self.emptied = asyncio.Event()
+        """Set while all results are settled."""
+        self.emptied.set()
         self._uploaded: set[str] = set()
         """Digests of waiting results' blobs that are uploaded."""
         self._n_lost = 0
@@ -109,23 +110,19 @@ class Outbox:
         self._results.append(result)
         self._n_bytes += _n_bytes(result)
         self._filled.set()
-        self._emptied.clear()
-        if len(self._results) >= MAX_HAND_IN:
-            self.hurry()
+        self.emptied.clear()
+        self.hurry()
 
     def hurry(self) -> None:
-        """Reports the available results without waiting for more."""
-        self._hurried.set()
-
-    async def wait_empty(self) -> None:
-        """Returns when all results have left."""
-        await self._emptied.wait()
+        """Reports the available results at once where no more follow soon, or where they fill a report."""
+        if not self._more_follow() or len(self._results) >= MAX_HAND_IN:
+            self._hurried.set()
 
     async def run(self) -> None:
         """Reports results until cancelled."""
         while True:
             while not self._results:
-                self._emptied.set()
+                self.emptied.set()
                 self._filled.clear()
                 await self._filled.wait()
             await self._linger()
@@ -157,7 +154,7 @@ class Outbox:
         """The oldest results that fit into one message, ready to send; their large parts are uploaded."""
         batch: list[JobResult] = []
         size = 0
-        for result in list(self._results)[: 1 if self._one_by_one else MAX_HAND_IN]:
+        for result in [*self._results][: 1 if self._one_by_one else MAX_HAND_IN]:
             try:
                 ready, weight = await self._portable(result)
             except (RefusedError, ProtocolError):
@@ -222,7 +219,9 @@ class Outbox:
             return
         result = self._results[0]
         log.error("result refused for good", lease=result.lease_id, kind=result.kind, why=why)
-        self._settle(report=False)
+        if result.kind == "failed" and not result.episodes:
+            self._settle()
+            return
         report = JobResult(
             lease_id=result.lease_id,
             job_id=result.job_id,
@@ -230,23 +229,20 @@ class Outbox:
             kind="failed",
             error=f"its result was refused: {why}"[: REASON_CHARACTERS["result"]],
         )
-        if result.kind == "failed" and not result.episodes:
-            self._on_settled(result)
-        else:
-            self._results.appendleft(report)
-            self._n_bytes += _n_bytes(report)
-            self._one_by_one += 1
+        self._n_bytes += _n_bytes(report) - _n_bytes(result)
+        self._results[0] = report
+        self._n_lost = 0
+        self._one_by_one = max(1, self._one_by_one)
 
-    def _settle(self, *, report: bool = True) -> None:
-        """Removes the oldest result; `report`: whether to call `on_settled`."""
+    def _settle(self) -> None:
+        """Removes the oldest result."""
         result = self._results.popleft()
         self._n_bytes -= _n_bytes(result)
         self._n_lost = 0
         self._one_by_one = max(0, self._one_by_one - 1)
         if not self._results:
             self._uploaded.clear()
-        if report:
-            self._on_settled(result)
+        self._on_settled(result)
 
 
 def _n_bytes(result: JobResult) -> int:

@@ -18,7 +18,7 @@ import subprocess
 import sys
 import tempfile
 import zipfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from importlib import metadata
 from pathlib import Path
 from typing import Annotated
@@ -36,6 +36,7 @@ from evopolicy_common.errors import ConfigError, MachineError
 from evopolicy_common.processes.parent_death import ending_with_parent
 from evopolicy_common.processes.preflight import check_writable
 from evopolicy_common.terminal import one_line, say
+from evopolicy_worker.check_env import Browser
 from evopolicy_worker.environments.browser import chromium
 from evopolicy_worker.environments.checks.conformance import CheckResult
 from evopolicy_worker.environments.interface.settings import BROWSER, use_browser
@@ -43,9 +44,8 @@ from evopolicy_worker.environments.interface.settings import BROWSER, use_browse
 DISTRIBUTION = "evopolicy"
 _PIP = ("-m", "pip", "--disable-pip-version-check", "--no-input")
 _NO_NETWORK = re.compile(
-    r"NewConnectionError|name resolution|Network is unreachable|Connection refused|ConnectTimeout|Max"
-    r" retries|ProxyError"
-    r"|from versions: none",
+    r"NewConnectionError|name resolution|Network is unreachable|Connection refused|ConnectTimeout"
+    r"|Max retries|ProxyError|from versions: none",
     re.IGNORECASE,
 )
 _NO_VERSION = re.compile(r"No matching distribution found for ([^\s(]+)")
@@ -61,34 +61,33 @@ def command(
     python: Annotated[
         str | None, typer.Option(help="Interpreter of the virtual environment; default: this one.")
     ] = None,
-    browser: Annotated[
-        Path | None,
-        typer.Option(
-            exists=True,
-            dir_okay=False,
-            help=(
-                "Chromium's program, for environments that are web pages; default: the machine's own, which root"
-                " installs."
-            ),
-        ),
-    ] = None,
+    browser: Browser = None,
 ) -> None:
     """Install families of environments, in tested versions, into a virtual environment of their own.
 
     Example: evopolicy-worker setup mo_gymnasium
 
     Use this for families whose packages conflict with those installed here, or to keep this installation unchanged.
-    Local commands find the virtual environment and start a worker from it.
+    Local commands find the virtual environment and start a worker from it. For web pages, root also installs Chromium.
     """
     use_browser(browser)
-    with fail_on_our_errors():
+    with fail_on_our_errors(), contextlib.ExitStack() as stack:
         wanted = _wanted(family)
         folder = (into or installs.root() / "+".join(wanted)).absolute()
         if folder.is_symlink():  # made by an earlier --into, whose folder is written anew
             folder = folder.resolve()
         _check_free(folder)
-        with _alone(folder):
-            _make(wanted, folder, python or sys.executable)
+        check_writable(folder.parent, "--into")
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        lock = stack.enter_context((folder.parent / f".{folder.name}.lock").open("w"))
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise ConfigError(
+                f"another setup is installing into {folder}: wait until it has ended, or name another folder with"
+                " --into"
+            ) from None
+        _make(wanted, folder, python or sys.executable)
         _link(folder, "+".join(wanted))
         worker = folder / "bin" / "evopolicy-worker"
         say(f"installed {', '.join(wanted)} in {folder}")
@@ -123,22 +122,6 @@ def _check_free(folder: Path) -> None:
         raise ConfigError(f"--into {folder}: the folder has other files; name a new one")
 
 
-@contextlib.contextmanager
-def _alone(folder: Path) -> Iterator[None]:
-    """Held while the folder is written. Raises ConfigError when another `setup` writes it."""
-    check_writable(folder.parent, "--into")
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    with (folder.parent / f".{folder.name}.lock").open("w") as lock:
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise ConfigError(
-                f"another setup is installing into {folder}: wait until it has ended, or name another folder with"
-                " --into"
-            ) from None
-        yield
-
-
 def _make(wanted: Mapping[str, Install], folder: Path, python: str) -> None:
     """Makes the virtual environment in `folder`, in place of an earlier one. Raises ConfigError or MachineError."""
     _check_free(folder)
@@ -151,7 +134,8 @@ def _make(wanted: Mapping[str, Install], folder: Path, python: str) -> None:
     if folder.exists():
         shutil.rmtree(folder)
     folder.mkdir(parents=True)
-    _mark(folder, made)
+    mark = folder / installs.MARK
+    mark.write_bytes(msgspec.json.format(msgspec.json.encode(made)))
     say(f"installing into {folder}: a minute or more, about {needed} MB", err=True)
     _run([python, "-m", "venv", str(folder)], "the virtual environment")
     own = msgspec.structs.replace(made, folder=str(folder))
@@ -165,7 +149,7 @@ def _make(wanted: Mapping[str, Install], folder: Path, python: str) -> None:
             _run([own.python, *_PIP, "install", "--quiet", "--no-deps", *apart], ", ".join(apart))
     for name in wanted:
         _try(own, name)
-    _mark(folder, msgspec.structs.replace(made, ready=True))
+    mark.write_bytes(msgspec.json.format(msgspec.json.encode(msgspec.structs.replace(made, ready=True))))
 
 
 def install_browser() -> None:
@@ -188,10 +172,6 @@ def install_browser() -> None:
     )
 
 
-def _mark(folder: Path, made: Made) -> None:
-    (folder / installs.MARK).write_bytes(msgspec.json.format(msgspec.json.encode(made)))
-
-
 def _check_python(wanted: Mapping[str, Install], python: str) -> None:
     try:
         command = [python, "-c", "import sys, venv, ensurepip; print(*sys.version_info[:2], sep='.')"]
@@ -203,9 +183,8 @@ def _check_python(wanted: Mapping[str, Install], python: str) -> None:
             f"{python} makes no virtual environments: {last_line(done.stderr)}; install its venv module (Debian:"
             " python3-venv) or name another with --python"
         )
-    found = _numbers(done.stdout)
     for name, each in wanted.items():
-        if not _numbers(each.python[0]) <= found < _numbers(each.python[1]):
+        if not _numbers(each.python[0]) <= _numbers(done.stdout) < _numbers(each.python[1]):
             raise ConfigError(
                 f"{name} is tested with Python {each.python[0]} up to, but not including, {each.python[1]}, and"
                 f" {python} is {done.stdout.strip()}: name another with --python"
@@ -246,12 +225,12 @@ def _ourselves(scratch: Path, extras: str) -> list[str]:
     return [f"{wheel(installed, scratch)}[{extras}]"]
 
 
-def wheel(found: metadata.Distribution, folder: Path) -> Path:
+def wheel(installed: metadata.Distribution, folder: Path) -> Path:
     """A wheel of an installed distribution's files, written into `folder`."""
-    path = folder / f"{DISTRIBUTION}-{found.version}-py3-none-any.whl"
+    path = folder / f"{DISTRIBUTION}-{installed.version}-py3-none-any.whl"
     records, own = [], ""
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as file:
-        for each in found.files or ():
+        for each in installed.files or ():
             name = each.as_posix()
             if name.endswith(".dist-info/RECORD"):
                 own = name
@@ -266,30 +245,30 @@ def wheel(found: metadata.Distribution, folder: Path) -> Path:
     return path
 
 
-def _run(program: Sequence[str], what: str) -> None:
+def _run(program: Sequence[str], part: str) -> None:
     # pip ends with this process: otherwise it would go on to write into a folder that is made again.
     done = subprocess.run(
         ending_with_parent(program), capture_output=True, text=True, check=False, stdin=subprocess.DEVNULL
     )
     if done.returncode:
-        raise failure(what, done.stderr + done.stdout)
+        raise failure(part, done.stderr + done.stdout)
 
 
-def failure(what: str, output: str) -> ConfigError:
+def failure(part: str, output: str) -> ConfigError:
     """The error for a failed step of the installation, from the program's output."""
     if _NO_NETWORK.search(output):
         return MachineError(
-            f"{what}: no package index with it can be reached: check the network, and pip's index-url and proxy (`pip"
+            f"{part}: no package index with it can be reached: check the network, and pip's index-url and proxy (`pip"
             " config list`)"
         )
     if "No space left" in output or "Errno 28" in output:
-        return MachineError(f"{what}: no space is left; make room, or name another folder with --into")
+        return MachineError(f"{part}: no space is left; make room, or name another folder with --into")
     if match := _NO_VERSION.search(output):
         return ConfigError(
-            f"{what}: the package index has no {match[1]} for this Python and platform; name another interpreter with"
+            f"{part}: the package index has no {match[1]} for this Python and platform; name another interpreter with"
             " --python"
         )
-    return ConfigError(f"{what} cannot be installed: {last_line(output)}")
+    return ConfigError(f"{part} cannot be installed: {last_line(output)}")
 
 
 def last_line(output: str) -> str:

@@ -20,6 +20,7 @@ import time
 from collections import OrderedDict
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import msgspec
 
@@ -55,7 +56,7 @@ from evopolicy_common.wire.requests import Requester
 from evopolicy_common.wire.transport import Link
 from evopolicy_worker.bundle_cache import BundleCache
 from evopolicy_worker.capabilities import Capabilities
-from evopolicy_worker.heartbeat import HeartbeatThread, HeldLeases
+from evopolicy_worker.heartbeat import HeartbeatThread
 from evopolicy_worker.outbox import Outbox
 from evopolicy_worker.slot_protocol.begun import HandedBack
 from evopolicy_worker.slots.slot import Slot
@@ -105,15 +106,9 @@ class Supervisor:
         self._ask: Requester[WorkerReply] = Requester(
             link, lambda verb: keys.worker_key(cluster, verb), codec.worker_replies
         )
-        self._held = HeldLeases()
         self._failed: asyncio.Future[None] = asyncio.get_running_loop().create_future()
         self._heartbeat = HeartbeatThread(
-            link,
-            cluster,
-            options.name,
-            self._held,
-            self._on_heartbeat_reply,
-            lambda error: self._fail("the heartbeat", error),
+            link, options.name, self._on_heartbeat_reply, lambda error: self._fail("the heartbeat", error)
         )
         self._bundles = BundleCache(options.scratch / "bundles", self._fetch)
         self._queue: OrderedDict[str, Lease] = OrderedDict()
@@ -127,14 +122,13 @@ class Supervisor:
             self._settled,
             more_follow=lambda: bool(self._queue),
         )
-        self._running: dict[str, Slot] = {}
+        self._running: dict[str, tuple[Lease, Slot]] = {}
         self._cancelled: set[str] = set()
+        """Ids of running leases."""
         self._session = self._token = ""
         self._lease_ttl_s = 0.0
-        self._leased: dict[str, Lease] = {}
-        """Leases of running jobs, by lease id."""
         self._registering = asyncio.Lock()
-        self._draining = asyncio.Event()
+        self.draining = asyncio.Event()
         self._warm_environments: OrderedDict[str, None] = OrderedDict()
         self.jobs_done = 0
 
@@ -152,15 +146,10 @@ class Supervisor:
         trying = asyncio.create_task(self._capabilities.keep_trying(self._register))
         try:
             await asyncio.wait([working, self._failed], return_when=asyncio.FIRST_COMPLETED)
-            if self._failed.done():
-                self._failed.result()
-            await working
+            await (self._failed if self._failed.done() else working)
         finally:
             self._heartbeat.stop()
-            tasks = [working, report_results, trying]
-            for task in tasks:
-                task.cancel()
-            await asyncio.gather(*tasks, return_exceptions=True)
+            await _ended(working, report_results, trying)
             self._failed.cancel()
 
     async def _report(self) -> None:
@@ -183,7 +172,8 @@ class Supervisor:
                 lease = group.create_task(self._lease_loop())
                 slots = [group.create_task(self._slot_loop(index)) for index in range(self._options.slots)]
                 silence = group.create_task(self._stop_in_silence())
-                await self._stop_when_drained(lease, slots)
+                await self.draining.wait()
+                await self._give_back(lease, slots)
                 silence.cancel()
         except* RefusedError as errors:
             refused = errors
@@ -192,42 +182,32 @@ class Supervisor:
         if refused is not None:
             raise refused
         with contextlib.suppress(TimeoutError):
-            await asyncio.wait_for(self._outbox.wait_empty(), self._options.grace_s)
+            await asyncio.wait_for(self._outbox.emptied.wait(), self._options.grace_s)
 
     def drain(self) -> None:
         """Stops requesting leases; `run` returns when the running jobs are done or the grace time is over."""
-        self._draining.set()
+        self.draining.set()
         self._work_arrived.set()
         self._capacity_freed.set()
 
-    @property
-    def draining(self) -> bool:
-        return self._draining.is_set()
-
     async def _register(self) -> None:
         async with self._registering:
-            options, capabilities = self._options, self._capabilities
+            options, credentials = self._options, self._link.credentials
             message = Register(
                 worker=options.name,
-                token=self._link.credentials.token,
+                token=credentials.token,
                 protocol=codec.WIRE_VERSION,
                 slots=options.slots,
-                tiers=capabilities.tiers,
-                missing_tiers=capabilities.missing_tiers,
-                environments=capabilities.environments,
-                undescribed=capabilities.undescribed,
-                failed_environments=capabilities.failed_environments,
                 fingerprint=options.fingerprint,
                 host=options.host,
                 boot_id=options.boot_id,
                 installation=installs.own(),
+                **self._capabilities.announced(),
             )
             reply = await self._ask.until_answered("register", message, Registered)
             self._session, self._lease_ttl_s, self._token = reply.session, reply.lease_ttl_s, message.token
             self._heartbeat.start(reply.session, reply.heartbeat_s)
-            log.info(
-                "registered", worker=options.name, cluster=self._link.credentials.cluster, slots=options.slots
-            )
+            log.info("registered", worker=options.name, cluster=credentials.cluster, slots=options.slots)
             for run, why in reply.refused.items():
                 log.warning("gets no work of a run", run=run, why=why)
             for env, why in reply.refused_environments.items():
@@ -252,7 +232,7 @@ class Supervisor:
             return
         for lease_id in reply.cancelled:
             self._cancel(lease_id)
-        if reply.drain and not self._draining.is_set():
+        if reply.drain and not self.draining.is_set():
             log.info("draining on request")
             self.drain()
         self._capabilities.describe_wanted(reply.describe)
@@ -261,35 +241,31 @@ class Supervisor:
         """Returns the waiting job, or stops the running one, of a lease that this worker no longer holds."""
         if lease_id in self._queue:
             log.info("lease is gone", lease=lease_id, was="waiting")
-            lease = self._queue.pop(lease_id)
-            self._put_result(lease, "returned")
-            self._hurry_at_the_end()
+            self._put_result(self._queue.pop(lease_id), "returned")
             self._capacity_freed.set()
         elif lease_id in self._running and lease_id not in self._cancelled:
             log.info("lease is gone", lease=lease_id, was="running")
             self._cancelled.add(lease_id)
-            slot = self._running[lease_id]
-            task = asyncio.create_task(slot.cancel())
-            task.add_done_callback(_log_failure)
+            _, slot = self._running[lease_id]
+            asyncio.create_task(slot.cancel()).add_done_callback(_log_failure)
 
     # Leasing.
 
     async def _lease_loop(self) -> None:
-        """Keeps a poll waiting at the coordinator while no more than half of the jobs leased ahead are left. So slots
+        """Keeps a poll waiting at the coordinator while at most half of the jobs leased ahead still wait. So slots
         never wait for a round trip, and short episodes still arrive in batches."""
         depth = 0
-        while not self._draining.is_set():
+        while not self.draining.is_set():
             self._capacity_freed.clear()
             slots = self._options.slots
             if len(self._queue) > max(slots, depth // 2) or self._outbox.full:
                 await self._capacity_freed.wait()
                 continue
-            wanted = max(1, 2 * slots - len(self._queue) - len(self._running))
-            session, serial = self._session, self._held.settled + 1
+            session, serial = self._session, self._heartbeat.settled + 1
             request = LeaseRequest(
                 worker=self._options.name,
                 session=session,
-                n=wanted,
+                n=max(1, 2 * slots - len(self._queue) - len(self._running)),
                 wait_s=LEASE_POLL_S,
                 warm_bundles=self._bundles.warm[-8:],
                 warm_environments=tuple(self._warm_environments),
@@ -298,7 +274,7 @@ class Supervisor:
             try:
                 reply = await self._ask.until_answered("lease", request, Leases, wait_s=LEASE_POLL_S)
             except RefusedError as error:
-                self._held.settle(serial)
+                self._heartbeat.settled = serial
                 if not await self._register_again(session, error):
                     raise
                 continue
@@ -306,8 +282,8 @@ class Supervisor:
                 self._cancel(lease_id)
             for lease in reply.leases:
                 self._queue[lease.lease_id] = lease
-                self._held.put(_held(lease, running=False))
-            self._held.settle(serial)
+                self._hold(lease, running=False)
+            self._heartbeat.settled = serial
             for lease_id in reply.cancelled:
                 self._cancel(lease_id)
             if reply.leases:
@@ -340,16 +316,12 @@ class Supervisor:
                 await _close_slot(slot)
 
     async def _prepared(self, index: int) -> Slot | None:
-        """Starts a slot of the safest tier and imports its simulators before work arrives, so that the first submit
-        need not wait.
-
-        None when that fails (the first lease hits the same failure and reports it), or when the worker is drained
-        meanwhile.
-        """
+        """A slot of the safest tier with its simulators imported before work arrives, so that the first submit need not
+        wait. None when that fails (the first lease reports the same failure), or when the worker is drained."""
         offered = [*(each.env for each in self._capabilities.environments), *self._capabilities.undescribed]
         slot = self._make_slot(index, self._capabilities.tiers[0])
         preparing = asyncio.create_task(slot.prepare(offered if len(offered) <= MAX_PREPARED else ()))
-        drained = asyncio.create_task(self._draining.wait())
+        drained = asyncio.create_task(self.draining.wait())
         try:
             await asyncio.wait({preparing, drained}, return_when=asyncio.FIRST_COMPLETED)
             if preparing.done():
@@ -358,25 +330,19 @@ class Supervisor:
         except (EvopolicyError, OSError) as error:
             log.info("slot is not prepared", slot=index, error=str(error))
         finally:
-            preparing.cancel()
-            drained.cancel()
-            await asyncio.gather(preparing, drained, return_exceptions=True)
+            await _ended(preparing, drained)
         await _close_slot(slot)
         return None
 
     async def _next_lease(self) -> Lease | None:
-        while not self._draining.is_set():
+        while not self.draining.is_set():
             if self._queue:
                 _, lease = self._queue.popitem(last=False)
-                self._hurry_at_the_end()
+                self._outbox.hurry()
                 return lease
             self._work_arrived.clear()
             await self._work_arrived.wait()
         return None
-
-    def _hurry_at_the_end(self) -> None:
-        if not self._queue:
-            self._outbox.hurry()
 
     async def _start_slot(self, index: int, lease: Lease) -> Slot | None:
         """A slot for the lease's tier. None when it does not start; the lease is then reported as failed."""
@@ -393,9 +359,8 @@ class Supervisor:
     async def _play(self, slot: Slot, lease: Lease) -> bool:
         """Plays one leased job and puts its result into the outbox. Returns False when the slot must be replaced."""
         job = lease.job
-        self._running[lease.lease_id] = slot
-        self._leased[lease.lease_id] = lease
-        self._held.put(_held(lease, running=True))
+        self._running[lease.lease_id] = lease, slot
+        self._hold(lease)
         last_reported = 0.0
 
         def on_progress(episodes_done: int, steps: int) -> None:
@@ -403,7 +368,7 @@ class Supervisor:
             now = time.monotonic()
             if now - last_reported > 0.2:
                 last_reported = now
-                self._held.put(_held(lease, running=True, episodes_done=episodes_done, steps=steps))
+                self._hold(lease, episodes_done=episodes_done, steps=steps)
 
         healthy, playing = True, False
         try:
@@ -425,19 +390,17 @@ class Supervisor:
                 self.jobs_done += 1
         except (EvopolicyError, OSError) as error:
             healthy = False
-            returned = lease.lease_id in self._cancelled
-            if not returned:
+            kind: ResultKind = "returned" if lease.lease_id in self._cancelled else "failed"
+            if kind == "failed":
                 log.error("job failed here", job=job.job_id, attempt=lease.attempt, error=str(error))
             begun = slot.begun if playing else None
-            broken = isinstance(error, BrokenEnvironmentError) and not returned
-            kind: ResultKind = "returned" if returned else "failed"
+            broken = isinstance(error, BrokenEnvironmentError) and kind == "failed"
             self._put_result(lease, kind, error=str(error), begun=begun, environment_fault=broken)
         except asyncio.CancelledError:
             self._put_result(lease, "returned", begun=slot.begun if playing else None)
             raise
         finally:
             self._running.pop(lease.lease_id, None)
-            self._leased.pop(lease.lease_id, None)
             self._cancelled.discard(lease.lease_id)
             self._capacity_freed.set()
         return healthy
@@ -487,27 +450,40 @@ class Supervisor:
         )
 
     def _settled(self, result: JobResult) -> None:
-        self._held.drop(result.lease_id)
+        self._heartbeat.held.pop(result.lease_id, None)
         self._capacity_freed.set()
+
+    def _hold(self, lease: Lease, *, running: bool = True, episodes_done: int = 0, steps: int = 0) -> None:
+        """Lists the lease in the heartbeats from the next one on, or updates its progress there."""
+        self._heartbeat.held[lease.lease_id] = HeldLease(
+            lease_id=lease.lease_id,
+            job_id=lease.job.job_id,
+            attempt=lease.attempt,
+            running=running,
+            episodes_done=episodes_done,
+            steps=steps,
+        )
 
     async def _stop_in_silence(self) -> None:
         while True:
             await asyncio.sleep(SILENCE_CHECK_S)
             if self._heartbeat.silent_s <= self._lease_ttl_s:
                 continue
-            for lease in (*self._queue.values(), *self._leased.values()):
+            for lease in (*self._queue.values(), *(lease for lease, _ in self._running.values())):
                 if lease.stop_in_silence:
                     self._cancel(lease.lease_id)
 
-    # Ending.
-
-    async def _stop_when_drained(self, lease: asyncio.Task[None], slots: list[asyncio.Task[None]]) -> None:
-        await self._draining.wait()
-        await self._withdraw_poll(lease)
+    async def _give_back(self, lease: asyncio.Task[None], slots: list[asyncio.Task[None]]) -> None:
+        """Returns the waiting jobs, and the running ones after the grace time."""
+        # The waiting poll is withdrawn, since its answer could bring leases that this worker would lose.
+        request = LeaseRequest(worker=self._options.name, session=self._session, n=0, wait_s=0.0)
+        with contextlib.suppress(EvopolicyError):
+            await self._ask.once("lease", request, Leases)
+        await asyncio.wait({lease}, timeout=WITHDRAW_TIMEOUT_S)
+        lease.cancel()
         while self._queue:
             _, waiting = self._queue.popitem(last=False)
             self._put_result(waiting, "returned")
-        self._hurry_at_the_end()
         _, late = await asyncio.wait(slots, timeout=self._options.grace_s)
         if late:
             log.warning("giving running episodes back", slots=len(late))
@@ -517,24 +493,12 @@ class Supervisor:
             for task in stuck:
                 task.cancel()
 
-    async def _withdraw_poll(self, lease: asyncio.Task[None]) -> None:
-        """Withdraws the waiting poll, whose answer could bring leases that this worker would lose."""
-        request = LeaseRequest(worker=self._options.name, session=self._session, n=0, wait_s=0.0)
-        with contextlib.suppress(EvopolicyError):
-            await self._ask.once("lease", request, Leases)
-        await asyncio.wait({lease}, timeout=WITHDRAW_TIMEOUT_S)
-        lease.cancel()
 
-
-def _held(lease: Lease, *, running: bool, episodes_done: int = 0, steps: int = 0) -> HeldLease:
-    return HeldLease(
-        lease_id=lease.lease_id,
-        job_id=lease.job.job_id,
-        attempt=lease.attempt,
-        running=running,
-        episodes_done=episodes_done,
-        steps=steps,
-    )
+async def _ended(*tasks: asyncio.Task[Any]) -> None:
+    """Cancels these tasks, and returns once they have ended."""
+    for task in tasks:
+        task.cancel()
+    await asyncio.gather(*tasks, return_exceptions=True)
 
 
 def _log_failure(task: asyncio.Task[None]) -> None:

@@ -34,7 +34,7 @@ _MODULES = {
     "evopolicy_coordinator.cli.envs:app": "envs",
     "evopolicy_coordinator.cli.gc:disk_app": "disk",
     "evopolicy_coordinator.cli.gc:gc_app": "gc",
-    "evopolicy_worker.sandbox.doctor_command:app": "doctor",
+    "evopolicy_worker.doctor:app": "doctor",
     "evopolicy_gateway.cli.files:app": "files texts schema",
     "evopolicy_coordinator.cli.data:app": "data",
 }

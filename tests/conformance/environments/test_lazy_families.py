@@ -18,7 +18,7 @@ import pytest
 from evopolicy_common import catalogue
 from evopolicy_common.errors import BrokenEnvironmentError
 from evopolicy_common.messages.environment import EnvironmentDescription
-from evopolicy_worker import descriptions
+from evopolicy_worker import capabilities
 from evopolicy_worker.environments import describe, process_environment, registry
 from evopolicy_worker.environments.browser import page
 
@@ -54,8 +54,8 @@ SORTS = """
 import json, sys
 from pathlib import Path
 from evopolicy_common import catalogue
-from evopolicy_worker import descriptions
-_, now, later = descriptions.sorted_out(catalogue.entries(), descriptions.Cache("code", Path(sys.argv[1])))
+from evopolicy_worker import capabilities
+_, now, later = capabilities.sorted_out(catalogue.entries(), capabilities.Cache("code", Path(sys.argv[1])))
 assert now == [] and len(later) > 390
 print(json.dumps(sorted({name.partition(".")[0] for name in sys.modules})))
 """
@@ -103,24 +103,24 @@ class Scripted:
 
 
 def test_few_are_described_at_the_start_and_many_on_first_use(tmp_path: Path) -> None:
-    cache = descriptions.Cache("code", tmp_path)
+    cache = capabilities.Cache("code", tmp_path)
     ids = list(catalogue.entries())
-    assert descriptions.sorted_out(ids[:16], cache) == ([], ids[:16], [])
-    assert descriptions.sorted_out([*ids, "my_pkg:Env-v0"], cache) == ([], ["my_pkg:Env-v0"], ids)
+    assert capabilities.sorted_out(ids[:16], cache) == ([], ids[:16], [])
+    assert capabilities.sorted_out([*ids, "my_pkg:Env-v0"], cache) == ([], ["my_pkg:Env-v0"], ids)
     toys = ["toy/line", "toy/maze"]
-    found, _ = asyncio.run(descriptions.describe_all(toys, Scripted(), cache))
-    assert descriptions.sorted_out(toys, cache) == (list(found), [], [])
-    known, _, later = descriptions.sorted_out(ids, cache)
+    found, _ = asyncio.run(capabilities.describe_all(toys, Scripted(), cache))
+    assert capabilities.sorted_out(toys, cache) == (list(found), [], [])
+    known, _, later = capabilities.sorted_out(ids, cache)
     assert [each.env for each in known] == toys
     assert len(later) == len(ids) - 2
 
 
 def test_a_description_holds_for_one_fingerprint(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    cache = descriptions.Cache("code", tmp_path)
+    cache = capabilities.Cache("code", tmp_path)
     description = describe("toy/line")
     cache.put(description)
     assert cache.get("toy/line") == description
-    assert descriptions.Cache("other code", tmp_path).get("toy/line") is None
+    assert capabilities.Cache("other code", tmp_path).get("toy/line") is None
     monkeypatch.setattr(registry, "versions", lambda names: {"numpy": "0"})
     assert cache.get("toy/line") is None
     monkeypatch.undo()
@@ -143,14 +143,14 @@ def test_facts_of_a_made_environment_are_neither_kept_nor_forced(
         raise AssertionError("a browser is started outside the jail")
 
     monkeypatch.setattr(page, "Chromium", start)
-    cache = descriptions.Cache("code", tmp_path)
+    cache = capabilities.Cache("code", tmp_path)
     cache.put(msgspec.structs.replace(describe("toy/line"), env=env_id))
     assert not list(tmp_path.iterdir())
     assert cache.get(env_id) is None
 
 
 def test_a_description_of_another_environment_is_not_taken(tmp_path: Path) -> None:
-    cache = descriptions.Cache("code", tmp_path)
+    cache = capabilities.Cache("code", tmp_path)
     cache.put(describe("toy/line"))
     (file,) = tmp_path.iterdir()
     file.write_bytes(file.read_bytes().replace(b'"env":"toy/line"', b'"env":"toy/maze"'))
@@ -161,7 +161,7 @@ def test_an_undescribable_environment_is_left_out_and_others_are_offered(
     tmp_path: Path,
 ) -> None:
     slot = Scripted()
-    found, failed = asyncio.run(descriptions.describe_all(["gym/ant5", "toy/line"], slot))
+    found, failed = asyncio.run(capabilities.describe_all(["gym/ant5", "toy/line"], slot))
     assert [each.env for each in found] == ["toy/line"]
     assert slot.starts == 2
     assert list(failed) == ["gym/ant5"]
@@ -196,6 +196,6 @@ def test_an_oversized_description_is_left_out_and_others_are_offered(
             (found,) = await super().describe(env_ids)
             return (msgspec.structs.replace(found, **changed) if found.env == "toy/line" else found,)
 
-    found, failed = asyncio.run(descriptions.describe_all(["toy/line", "toy/maze"], Odd()))
+    found, failed = asyncio.run(capabilities.describe_all(["toy/line", "toy/maze"], Odd()))
     assert [each.env for each in found] == ["toy/maze"]
     assert re.search(why, failed["toy/line"])

@@ -182,8 +182,7 @@ def test_an_agent_that_stops_its_validation_again_and_again_gets_one_throw(
 
             def played_further() -> str | None:
                 """The group whose episode is played, once it has gone on from where it was stopped."""
-                held, _ = worker._held.snapshot()
-                steps = {each.job_id: each.steps for each in held}
+                steps = {each.job_id: each.steps for each in worker._heartbeat.held.values()}
                 return next((g for g in groups if steps.get(f"{g}/0", 0) > 2 + len(stored.begun(g))), None)
 
             async with gateway_of(coordinator, created) as gateway:

@@ -16,16 +16,16 @@ from machines.own_processes import alive
 
 from evopolicy_common.messages.environment import EnvironmentDescription
 from evopolicy_common.processes import proc
-from evopolicy_worker import descriptions
+from evopolicy_worker import capabilities
 from evopolicy_worker.slots.slot import Slot
 
 WORKER = """
 import asyncio, sys
 from pathlib import Path
 from evopolicy_common.processes.scratch import scratch_folder
-from evopolicy_worker import descriptions
-from evopolicy_worker.sandbox import available_tiers
+from evopolicy_worker import capabilities
 from evopolicy_worker.slots.slot import Slot
+from evopolicy_worker.slots.tiers import available_tiers
 
 print("begun", flush=True)
 tiers = available_tiers()
@@ -33,7 +33,7 @@ print("tiers", flush=True)
 async def describe(scratch):
     slot = Slot(None, tiers[0], scratch / "slot")
     try:
-        await descriptions.describe_all(["gym/acrobot", "gym/bipedal"], slot)
+        await capabilities.describe_all(["gym/acrobot", "gym/bipedal"], slot)
     finally:
         await slot.close()
 with scratch_folder("worker") as scratch:
@@ -57,7 +57,7 @@ async def described(
 ) -> tuple[tuple[EnvironmentDescription, ...], dict[str, str]]:
     slot = Slot(None, "bwrap", scratch / "slot")
     try:
-        return await descriptions.describe_all(env_ids, slot)
+        return await capabilities.describe_all(env_ids, slot)
     finally:
         await slot.close()
 
@@ -94,11 +94,11 @@ def test_a_worker_killed_during_its_start_leaves_nothing(tmp_path: Path) -> None
     assert semaphores() <= before
 
 
-@pytest.mark.parametrize("kills", [2, descriptions.TRIES])
+@pytest.mark.parametrize("kills", [2, capabilities.TRIES])
 def test_a_describing_process_that_is_killed_is_started_again(
     tmp_path: Path, kills: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(descriptions, "PAUSE_S", 0.0)
+    monkeypatch.setattr(capabilities, "PAUSE_S", 0.0)
     describe = Slot.describe
     left = kills
 
@@ -114,9 +114,9 @@ def test_a_describing_process_that_is_killed_is_started_again(
     monkeypatch.setattr(Slot, "describe", killed)
     found, _ = asyncio.run(described(["toy/line", "gym/acrobot"], tmp_path))
     # What ends its process again and again is left out.
-    assert [each.env for each in found] == ["toy/line", "gym/acrobot"][kills == descriptions.TRIES :]
+    assert [each.env for each in found] == ["toy/line", "gym/acrobot"][kills == capabilities.TRIES :]
     assert left == 0
-    left = descriptions.TRIES
+    left = capabilities.TRIES
     found, failed = asyncio.run(described(["toy/line"], tmp_path))
     assert not found
     assert re.search(r"environment toy/line: .* ended with status", failed["toy/line"])

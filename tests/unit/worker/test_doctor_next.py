@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 from typer.testing import CliRunner
 
-from evopolicy_worker.sandbox import doctor_command
-from evopolicy_worker.sandbox.doctor import Check
+from evopolicy_worker import doctor
+from evopolicy_worker.doctor import Check
 
 
 @pytest.mark.parametrize(
@@ -18,10 +18,10 @@ def test_the_demo_is_advised_only_where_its_jail_starts(
     def check(name: str, verdict: str) -> Check:
         return Check(name=name, verdict=verdict, found="x", without="x", advice="x")  # type: ignore[arg-type]
 
-    monkeypatch.setattr(doctor_command, "examine_machine", list)
+    monkeypatch.setattr(doctor, "examine_machine", list)
     found = (check("tier bwrap", verdict), check("tier landlock", "ok"))
-    monkeypatch.setattr(doctor_command, "examine", lambda: found)
-    done = CliRunner().invoke(doctor_command.app, [])
+    monkeypatch.setattr(doctor, "examine", lambda: found)
+    done = CliRunner().invoke(doctor.app, [])
     assert done.exit_code == 0
     assert told in done.stdout
     assert ("evopolicy demo" in done.stdout) == (verdict == "ok")

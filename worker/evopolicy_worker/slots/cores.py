@@ -17,20 +17,16 @@ class Cores:
     """Assigns cores, preferring those that no worker of this machine has taken."""
 
     def __init__(self) -> None:
-        self._allowed = sorted(os.sched_getaffinity(0))
+        self.allowed = sorted(os.sched_getaffinity(0))
+        """The cores that this process may use; by default it has a slot for each."""
         self._locks: dict[int, IO[bytes]] = {}
         self._shared = 0
         self._folder = Path(tempfile.gettempdir()) / f"evopolicy-cores-{os.getuid()}"
         self._folder.mkdir(mode=0o700, exist_ok=True)
 
-    @property
-    def count(self) -> int:
-        """Number of cores that this process may use; the default number of slots."""
-        return len(self._allowed)
-
     def take(self) -> int:
         """A core for one more slot: a free one, or the next in turn when all are taken."""
-        for core in self._allowed:
+        for core in self.allowed:
             if core in self._locks:
                 continue
             lock = (self._folder / f"core-{core}.lock").open("ab")
@@ -41,7 +37,7 @@ class Cores:
                 continue
             self._locks[core] = lock
             return core
-        core = self._allowed[self._shared % len(self._allowed)]
+        core = self.allowed[self._shared % len(self.allowed)]
         self._shared += 1
         return core
 
