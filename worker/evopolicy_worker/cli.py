@@ -40,9 +40,9 @@ from evopolicy_worker.doctor import best_tier, examine
 from evopolicy_worker.environments.interface.calls import USUAL, Limits
 from evopolicy_worker.environments.interface.fingerprint import fingerprint
 from evopolicy_worker.environments.interface.settings import use_browser
-from evopolicy_worker.slots.cores import Cores
+from evopolicy_worker.slots import cores
 from evopolicy_worker.slots.slot import Slot
-from evopolicy_worker.slots.tiers import SANDBOXED, available_tiers, why_not
+from evopolicy_worker.slots.tiers import SANDBOXED, available_tiers, try_out, why_not
 from evopolicy_worker.supervisor import MAX_PREPARED, Options, Supervisor
 
 app = App(add_completion=True)
@@ -260,9 +260,8 @@ async def _run(
 ) -> None:
     """`joining`: the credentials; None where they do not exist before `ready_file` is written. `packages`: those that
     policies may import besides numpy."""
-    cores = Cores()
     notify_of_many_slots(n_slots or 0)
-    taken = [cores.take() for _ in range(n_slots or len(cores.allowed))]
+    taken = cores.take(n_slots)
     importable = policy_versions(packages)
     # Environments that do not ship are defined in the processes that play them.
     foreign = tuple(catalogue.entry(env_id) for env_id in env_ids if not catalogue.is_shipped(env_id))
@@ -290,11 +289,7 @@ async def _run(
         return importing(made), failed
 
     async def probe(tier: Tier) -> None:
-        slot = new_slot(None, "probe", tier)
-        try:
-            await slot.start()
-        finally:
-            await slot.close()
+        await try_out(new_slot(None, "probe", tier))
 
     main = asyncio.current_task()
     assert main is not None
@@ -352,7 +347,6 @@ async def _run(
     finally:
         for slot in kept.values():
             await slot.close()
-        cores.close()
 
 
 def main() -> None:

@@ -38,13 +38,14 @@ def why_not(tier: Tier) -> str | None:
         scratch = folder / "slot"
         try:
             jail.plan(tier, scratch, ("numpy",))
-            asyncio.run(_try_out(Slot(None, tier, scratch)))
+            asyncio.run(try_out(Slot(None, tier, scratch)))
         except (EvopolicyError, OSError) as error:
             return str(error)
     return None
 
 
-async def _try_out(slot: Slot) -> None:
+async def try_out(slot: Slot) -> None:
+    """Starts the slot and closes it. Raises as `Slot.start`."""
     try:
         await slot.start()
     finally:
