@@ -151,7 +151,7 @@ PLAIN: dict[str | None, dict[str, str]] = {
         "all modules deleted": "sys.modules.clear(); sys.stdout = sys.stderr = None; return []",
     },
 }
-"""What is done in `act`, by verdict and name, under the usual limits and with no other way to succeed."""
+"""Code for `act`, by verdict and name, under the usual limits and with no other way to succeed."""
 
 BREAKERS = (
     Breaker(

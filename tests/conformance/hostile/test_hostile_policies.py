@@ -38,7 +38,7 @@ pytestmark = pytest.mark.slow
 
 SEED = 1_987_654_321
 PACKAGES = [(), ("scipy",)]
-"""What policies may import besides numpy: a run's `--policy-package`."""
+"""Packages that policies may import besides numpy: a run's `--policy-package`."""
 RECORDINGS: dict[str, Callable[[str], object]] = {
     "secret.mat": lambda path: scipy.io.savemat(path, {"seed": 7}),
     "secret.wav": lambda path: scipy.io.wavfile.write(path, 8000, np.zeros(8, dtype=np.int16)),
@@ -49,7 +49,7 @@ RECORDINGS: dict[str, Callable[[str], object]] = {
 
 @pytest.fixture(scope="module")
 def target(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Any]]:
-    """What there is to attack, all of it on this machine's loopback."""
+    """The targets of attacks, all on this machine's loopback."""
     folder = tmp_path_factory.mktemp("target")
     secret = folder / "seeds.json"
     secret.write_text("the hidden seeds")
@@ -104,7 +104,7 @@ def probe(slots: Slots, name: str, parameters: dict[str, Any], **options: Any) -
 
 
 def attempts(outcome: EpisodeOutcome) -> dict[str, list[str]]:
-    """What the probe printed, by `held` and `THROUGH`."""
+    """The probe's output, by `held` and `THROUGH`."""
     found: dict[str, list[str]] = {"held": [], "THROUGH": []}
     for line in outcome.stdout.decode().splitlines():
         verdict, _, rest = line.partition(": ")

@@ -59,7 +59,7 @@ def play(folder: str) -> None:
 
 
 def harmed(source: str, timeout_s: float = _TIMEOUT_S) -> str | None:
-    """What became of an episode of that policy; None when it is the honest one, step by step."""
+    """The outcome of an episode of that policy; None when it is the honest one, step by step."""
     with tempfile.TemporaryDirectory(prefix="evp-undefended-") as name, contextlib.ExitStack() as stack:
         folder = Path(name)
         (folder / "policy.py").write_text(source)
@@ -122,7 +122,7 @@ def _timeout_left(results: Path, timeout_s: float, process: subprocess.Popen[byt
 
 
 def believe(path: str) -> str:
-    """What somebody finds who trusts the results; empty when they are sixty honest actions."""
+    """The harm to a reader who trusts the results; empty when they are sixty honest actions."""
     data = Path(path).read_bytes()
     at, n = 0, 0
     while at < len(data):

@@ -110,7 +110,7 @@ async def described(folder: Path) -> EnvironmentDescription:
 
 
 class Stored:
-    """What the coordinator has on its disk."""
+    """The coordinator's files."""
 
     def __init__(self, state: Path) -> None:
         self._path = state / "coordinator.sqlite"

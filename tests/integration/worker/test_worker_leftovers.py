@@ -40,7 +40,7 @@ with scratch_folder("worker") as scratch:
     asyncio.run(describe(scratch))
     print("described", flush=True)
 """
-"""What a worker does before it waits for its coordinator."""
+"""The steps of a worker before it waits for its coordinator."""
 
 
 def start(temporary: Path) -> subprocess.Popen[bytes]:
@@ -81,9 +81,9 @@ def test_a_worker_killed_during_its_start_leaves_nothing(tmp_path: Path) -> None
         worker.kill()
         worker.communicate()
     deadline = time.monotonic() + 30
-    while (left := [pid for pid in seen if alive(pid)]) and time.monotonic() < deadline:
+    while (remaining := [pid for pid in seen if alive(pid)]) and time.monotonic() < deadline:
         time.sleep(0.05)
-    assert not left
+    assert not remaining
     assert seen
     for folder in tmp_path.iterdir():
         # Its maker may have been killed before it was owned: such a one goes when it is a minute old.
@@ -100,12 +100,12 @@ def test_a_describing_process_that_is_killed_is_started_again(
 ) -> None:
     monkeypatch.setattr(capabilities, "PAUSE_S", 0.0)
     describe = Slot.describe
-    left = kills
+    kills_to_come = kills
 
     async def killed(self: Slot, env_ids: list[str]) -> object:
-        nonlocal left
-        if left:
-            left -= 1
+        nonlocal kills_to_come
+        if kills_to_come:
+            kills_to_come -= 1
             assert self._process is not None
             inside = proc.descendants(self._process.pid)
             os.kill(inside[1], signal.SIGKILL)
@@ -113,10 +113,10 @@ def test_a_describing_process_that_is_killed_is_started_again(
 
     monkeypatch.setattr(Slot, "describe", killed)
     found, _ = asyncio.run(described(["toy/line", "gym/acrobot"], tmp_path))
-    # What ends its process again and again is left out.
+    # An environment that ends its process again and again is not offered.
     assert [each.env for each in found] == ["toy/line", "gym/acrobot"][kills == capabilities.TRIES :]
-    assert left == 0
-    left = capabilities.TRIES
+    assert kills_to_come == 0
+    kills_to_come = capabilities.TRIES
     found, failed = asyncio.run(described(["toy/line"], tmp_path))
     assert not found
     assert re.search(r"environment toy/line: .* ended with status", failed["toy/line"])

@@ -21,7 +21,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 @pytest.fixture(scope="module", autouse=True)
 def _own_garbage() -> Iterator[None]:
-    """What files of other folders left to be collected is not reported here."""
+    """Garbage of other folders' files is not reported here."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         gc.collect()

@@ -1,4 +1,4 @@
-"""What `evopolicy doctor` advises at its end."""
+"""The advice at the end of `evopolicy doctor`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a worker is called that is given no name."""
+"""Names of workers that are given none."""
 
 from __future__ import annotations
 

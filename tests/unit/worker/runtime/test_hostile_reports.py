@@ -1,4 +1,4 @@
-"""Whatever a policy's process sends is bounded and checked before it is used, and never costs the slot or the
+"""All bytes from a policy's process are bounded and checked before they are used, and never cost the slot or the
 episode."""
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What the episodes of one job may say together: it has to fit into what a coordinator takes."""
+"""The output of all episodes of one job together: it has to fit into a message to the coordinator."""
 
 from __future__ import annotations
 

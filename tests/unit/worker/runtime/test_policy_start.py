@@ -1,4 +1,4 @@
-"""What the zygote does once for all policies shows in none of them."""
+"""No policy sees the work that the zygote does once for all policies."""
 
 from __future__ import annotations
 
@@ -89,14 +89,14 @@ def test_a_policys_generators_begin_as_numpy_seeds_them(
 def test_a_policy_finds_its_process_as_if_new(slots: Slots, tier: str) -> None:
     outcome = slots.play(SEES, tier=tier)
     assert outcome.failure is None
-    streams, is_first, home, temporary, binds, has_pwd, drawn, numpys, modules, left = json.loads(
+    streams, is_first, home, temporary, binds, has_pwd, drawn, numpys, modules, counts = json.loads(
         outcome.stdout
     )
     assert streams == [[False, True, "utf-8"]] * 2
     assert (is_first, temporary, binds, has_pwd) == (True, f"{home}/tmp", False, False)
     assert modules == ["policy"]
     # Nothing of the policy that the zygote imported.
-    assert left == [1, ["system", "tmp"], ["policy.py"], []]
+    assert counts == [1, ["system", "tmp"], ["policy.py"], []]
     again = json.loads(slots.play(SEES, tier=tier).stdout)
     assert (drawn, numpys) == (again[6], again[7])
 

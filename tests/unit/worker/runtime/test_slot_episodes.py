@@ -1,4 +1,4 @@
-"""What a policy is given, what is recorded of it, and that the same episode is the same bytes."""
+"""A policy's inputs, the record of its episode, and that the same episode is the same bytes."""
 
 from __future__ import annotations
 

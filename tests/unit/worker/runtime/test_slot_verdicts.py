@@ -55,7 +55,7 @@ FAILS = {
         "import subprocess; subprocess.run(['/bin/true'])": "no process",
     },
 }
-"""What a failure in `act` says, by its category."""
+"""Code for `act` and a part of the failure's message, by its category."""
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""What a policy can do to itself is its failure, or has no effect; none gives it another throw of its dice."""
+"""A policy that harms itself has failed, or nothing changes; neither gives it another throw of its dice."""
 
 from __future__ import annotations
 
