@@ -5,8 +5,9 @@ Rules:
 - A description holds for one fingerprint: this software's code, the environment's definition, the versions of its
   packages, Python. The cache has the last description of each shipped environment whose fingerprint is known without
   making it. This process makes none: it has the worker's credentials and is in no jail.
-- At the start a worker describes the environments that do not ship, since operators approve them by their digest, and
-  at most `AT_ONCE` shipped ones. It announces others undescribed, and describes them once runs wait for them.
+- At the start a worker describes the environments that do not ship, since operators approve them by their
+  digest, and at most `AT_ONCE` shipped ones. It announces others undescribed, and describes them once runs
+  wait for them.
 - An environment that cannot be described, or fails its try-out, is not offered.
 """
 
@@ -76,7 +77,7 @@ class Capabilities:
     _describing: asyncio.Task[None] | None = field(default=None, init=False)
 
     def announced(self) -> dict[str, Any]:
-        """The fields of `Register`, with reasons as long as the coordinator accepts; the log has them whole."""
+        """The fields of `Register`, with reasons of accepted length; the log has them whole."""
         remaining, reasons = REASON_CHARACTERS["environments"], {}
         for env, why in self.failed_environments.items():
             reasons[env] = why[: min(REASON_CHARACTERS["environment"], remaining)]

@@ -67,11 +67,11 @@ class InASlot(msgspec.Struct, frozen=True, kw_only=True):
     it."""
 
     bare_us: float = 0.0
-    """Processor time of a step of the library's environment, without adapter and accelerations, µs; the median of
-    `TURNS`. 0: not measured, as of an episode of one step."""
+    """Processor time of a step of the library's environment, without adapter and accelerations, µs; the
+    median of `TURNS`. 0: not measured, as of an episode of one step."""
     slot_us: float = 0.0
-    """The same for the slot, with its policy, recording and accelerations. 0 also where all steps together take less
-    than `LEAST_S`."""
+    """The same for the slot, with its policy, recording and accelerations. 0 also where all steps together
+    take less than `LEAST_S`."""
     busy: bool = False
     """Whether the machine had more to do than it has cores."""
     memory_mb: int = 0
@@ -137,8 +137,8 @@ def check(env_ids: Sequence[str], steps: int, definitions: tuple[Entry, ...]) ->
 def _program(
     definitions: tuple[Entry, ...], variables: dict[str, str], name: str, *arguments: str
 ) -> Iterator[Callable[..., bytes]]:
-    """A running program of `environments.checks`: sends it a line, if one is given, and returns its next line, which is
-    empty once it has ended."""
+    """A running program of `environments.checks`: sends it a line, if one is given, and returns its next
+    line, which is empty once it has ended."""
     command = [sys.executable, "-P", "-m", f"evopolicy_worker.environments.checks.{name}", *arguments]
     # In a folder that is removed even if the process is killed.
     with scratch_folder("check") as scratch:

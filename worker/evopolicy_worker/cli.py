@@ -258,8 +258,8 @@ async def _run(
     scratch: Path,
     grace_s: float,
 ) -> None:
-    """`joining`: the credentials; None where they do not exist before `ready_file` is written. `packages`: those that
-    policies may import besides numpy."""
+    """`joining`: the credentials; None where they do not exist before `ready_file` is written. `packages`:
+    those that policies may import besides numpy."""
     notify_of_many_slots(n_slots or 0)
     taken = cores.take(n_slots)
     importable = policy_versions(packages)

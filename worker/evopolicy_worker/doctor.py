@@ -1,5 +1,5 @@
-"""Checks this machine: the rows of `evopolicy-worker doctor`, and of `evopolicy doctor`, which also checks everything
-but the sandbox, and prints the functions that work without each missing part."""
+"""Checks this machine: the rows of `evopolicy-worker doctor`, and of `evopolicy doctor`, which also checks
+everything but the sandbox, and prints the functions that work without each missing part."""
 
 from __future__ import annotations
 
@@ -99,7 +99,7 @@ def row(
 
 
 def examine() -> Iterator[Check]:
-    """All checks, in display order. The last ones start each sandbox tier once, which takes about a second."""
+    """All checks, in display order. The last ones start each sandbox tier, in about a second."""
     own, machine, landlock = fingerprint(), platform.machine(), jail.landlock_version()
     yield Check("kernel", "note", f"{platform.system()} {platform.release()} {machine}")
     boot_id = host.boot_id()

@@ -28,7 +28,8 @@ def clock() -> float:
 
 
 class HeartbeatThread:
-    """Sends the held leases every `every_s` seconds and passes the replies to the event loop, which changes the leases.
+    """Sends the held leases every `every_s` seconds and passes the replies to the event loop, which changes
+    the leases.
 
     One heartbeat always waits at the coordinator, so that a cancellation arrives without delay.
     """
@@ -45,8 +46,8 @@ class HeartbeatThread:
         self.held: dict[str, HeldLease] = {}
         """The leases that this worker holds, by id."""
         self.settled = time.time_ns() // 1_000_000
-        """Number of the last finished poll: its leases, and those of all before, are or were in `held`. Begins above
-        any number of an earlier process of this worker."""
+        """Number of the last finished poll: its leases, and those of all before, are or were in `held`.
+        Begins above any number of an earlier process of this worker."""
         self._link = link
         self._key = keys.worker_key(link.credentials.cluster, "beat")
         self._worker = worker

@@ -79,8 +79,9 @@ class Outbox:
         on_settled: Callable[[JobResult], None],
         more_follow: Callable[[], bool],
     ) -> None:
-        """`register_again` receives a session and its refusal, and returns whether it registered anew; `on_settled`
-        each settled result. `more_follow`: whether leased jobs wait for a slot; call `hurry` after each change."""
+        """`register_again` receives a session and its refusal, and returns whether it registered anew;
+        `on_settled` each settled result. `more_follow`: whether leased jobs wait for a slot; call `hurry`
+        after each change."""
         self._ask = ask
         self._worker = worker
         self._session = session

@@ -68,7 +68,7 @@ def command(
     Example: evopolicy-worker setup mo_gymnasium
 
     Use this for families whose packages conflict with those installed here, or to keep this installation unchanged.
-    Local commands find the virtual environment and start a worker from it. For web pages, root also installs Chromium.
+    Local commands find it and start a worker from it. For web pages, root also installs Chromium.
     """
     use_browser(browser)
     with fail_on_our_errors(), contextlib.ExitStack() as stack:

@@ -252,8 +252,8 @@ class Supervisor:
     # Leasing.
 
     async def _lease_loop(self) -> None:
-        """Keeps a poll waiting at the coordinator while at most half of the jobs leased ahead still wait. So slots
-        never wait for a round trip, and short episodes still arrive in batches."""
+        """Keeps a poll waiting at the coordinator while at most half of the jobs leased ahead still wait. So
+        slots never wait for a round trip, and short episodes still arrive in batches."""
         depth = 0
         while not self.draining.is_set():
             self._capacity_freed.clear()
@@ -316,8 +316,9 @@ class Supervisor:
                 await _close_slot(slot)
 
     async def _prepared(self, index: int) -> Slot | None:
-        """A slot of the safest tier with its simulators imported before work arrives, so that the first submit need not
-        wait. None when that fails (the first lease reports the same failure), or when the worker is drained."""
+        """A slot of the safest tier with its simulators imported before work arrives, so that the first
+        submit need not wait. None when that fails (the first lease reports the same failure), or when the
+        worker is drained."""
         offered = [*(each.env for each in self._capabilities.environments), *self._capabilities.undescribed]
         slot = self._make_slot(index, self._capabilities.tiers[0])
         preparing = asyncio.create_task(slot.prepare(offered if len(offered) <= MAX_PREPARED else ()))

@@ -48,13 +48,8 @@ _INT = struct.Struct("<q")
 _COUNT = struct.Struct("<I")
 _FLOAT = struct.Struct("<d")
 _EXT_ARRAY, _EXT_INT = 1, 2
-_DTYPES = {
-    np.dtype(name).newbyteorder("<").str.encode().ljust(4, b"\0"): np.dtype(name).newbyteorder("<")
-    for name in (
-        *("bool", "int8", "int16", "int32", "int64", "uint8", "uint16", "uint32", "uint64"),
-        *("float16", "float32", "float64"),
-    )
-}
+_CODES = ("?", "<i1", "<i2", "<i4", "<i8", "<u1", "<u2", "<u4", "<u8", "<f2", "<f4", "<f8")
+_DTYPES = {dtype.str.encode().ljust(4, b"\0"): dtype for dtype in map(np.dtype, _CODES)}
 
 
 class BadReplyError(Exception):

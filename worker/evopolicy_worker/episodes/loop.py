@@ -176,7 +176,7 @@ class Player:
     def _play(
         self, k: int, job: Job, progress: Progress, tell: _Tell, begun: Begun
     ) -> tuple[EpisodeOutcome, bytes, bytes]:
-        """The outcome of one episode, which continues from `begun`, the same framed, and the log of its actions."""
+        """The outcome of one episode, which continues from `begun`; the same framed; its log of actions."""
         n_ends = 0
         while True:
             environment = self._environment(job.env)
@@ -316,8 +316,8 @@ class _Episode:
     def _steps(self, source: Source, course: _Course) -> None:
         """Plays from reset to the end."""
         progress, taken, step, add = self.progress, self.begun.taken, self.environment.step, course.add
-        # A library that was compiled for speed may change rounding for the whole process when it is loaded, and an
-        # episode must not depend on those that were played before it.
+        # A library that was compiled for speed may change rounding for the whole process when it is loaded,
+        # and an episode must not depend on those that were played before it.
         reset_floats()
         obs = self.environment.reset(self.spec.case)
         for t in itertools.count():

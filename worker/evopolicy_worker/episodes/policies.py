@@ -73,7 +73,7 @@ class Progress:
 
 
 class Policies:
-    """The policy of each episode: its own, or one for several of a job. Removes what their processes leave behind."""
+    """The policy of each episode: its own, or one for several of a job. Removes its files at the end."""
 
     def __init__(self, zygote: Zygote, jail: Jail, monitor: Monitor, scratch: Path) -> None:
         self._zygote = zygote

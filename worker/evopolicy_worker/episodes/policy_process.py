@@ -221,7 +221,7 @@ class PolicyProcess:
                 how = f"it sent an action of {len(payload):,} bytes; {self._action_bytes:,} are the limit"
                 raise self._broken(how, self._action_bytes, len(payload))
             if len(payload) > self._usual_bytes:
-                # Actions are kept as they came, so their bytes beyond the usual size also have a limit in an episode.
+                # Actions are kept as they came, so an episode's bytes beyond the usual size have a limit.
                 self._surplus_bytes += len(payload) - self._usual_bytes
                 limit, used = self._limits.episode_action_bytes, self._surplus_bytes
                 if used > limit:

@@ -2,15 +2,15 @@
 `python -m evopolicy_worker.episodes.video ENV_ID`.
 
 Rules:
-- The episode is replayed from its actions in a rendering environment of that process. The original episode never
-  renders: its bytes are the same with and without a video, and no policy is charged for rendering.
+- The episode is replayed from its actions in a rendering environment of that process. The original episode
+  never renders: its bytes are the same with and without a video, and no policy is charged for rendering.
 - Frame t shows the state in which row t's action was chosen, that of the row's observation. There are as many frames as
   rows, and the state after the last step has none.
 - A replay that differs from the episode in any reward or flag yields no video, since it would show another episode.
 - A video is optional. Where an environment cannot be rendered here, or the renderer crashes or times out, the episode
   keeps its outcome without a video, and a note on standard error gives the reason.
-- The process renders one environment only, since a second one with MuJoCo's renderer has crashed processes. It is the
-  slot's child: pinned to the same core, and ended with the slot.
+- The process renders one environment only, since a second one with MuJoCo's renderer has crashed processes.
+  It is the slot's child: pinned to the same core, and ended with the slot.
 - One episode at a time: a framed `Order` on standard input, a framed `Made` on the original standard output. Output of
   simulators and drivers goes to standard error.
 """

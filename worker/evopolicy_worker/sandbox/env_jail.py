@@ -158,7 +158,7 @@ def _seal(tier: Tier, scratch: Path, user: int | None, drawn_with: tuple[str, ..
         namespaces = tier == "bwrap"
         signals = namespaces or jail.landlock_version() >= _SCOPES_SIGNALS
         program = seccomp.environment_filter(namespaces=namespaces, signals=signals)
-        # For all threads, without the mitigations of speculation with which older kernels slow filtered processes.
+        # For all threads, without the mitigations with which older kernels slow filtered processes.
         arguments, _buffer = inside.filter_of(program, os.getpid())
         number, flags = SECCOMP[platform.machine()], _ALL_THREADS | _SPECULATION
         inside.check(inside.libc.syscall(number, _SET_MODE_FILTER, flags, arguments), "seccomp")

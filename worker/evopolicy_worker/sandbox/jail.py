@@ -54,8 +54,9 @@ for those that it calls, and removes the additional variable."""
 
 
 class _PythonFiles(msgspec.Struct, frozen=True, kw_only=True):
-    """Files of this machine that the sandbox shows, read-only: the standard library, shared libraries, and only the
-    allowed packages. The site-packages folder is never shown as a whole, since it has simulators and our own code."""
+    """Files of this machine that the sandbox shows, read-only: the standard library, shared libraries, and
+    only the allowed packages. The site-packages folder is never shown as a whole, since it has simulators and
+    our own code."""
 
     interpreter: str
     """The interpreter's real file: not a link, nor the launcher of a virtual environment."""
@@ -158,8 +159,8 @@ def landlock_version() -> int:
 
 
 def _python_files(allowed_packages: tuple[str, ...]) -> _PythonFiles:
-    """For this interpreter, and these packages with their dependencies. Raises SandboxError that names the package when
-    it is not installed or cannot be shown alone."""
+    """For this interpreter, and these packages with their dependencies. Raises SandboxError that names the
+    package when it is not installed or cannot be shown alone."""
     interpreter = os.path.realpath(getattr(sys, "_base_executable", sys.executable))
     prefix = os.path.realpath(sys.base_prefix)
     read = [interpreter]

@@ -212,8 +212,8 @@ def _machine() -> str:
 
 
 def _assembled(machine: str, codes: Iterable[list[Instruction]]) -> bytes:
-    """The whole program: kills the process on a call of another architecture, and looks up all other calls. `codes`: of
-    each call number; the last is that of all higher ones too."""
+    """The whole program: kills the process on a call of another architecture, and looks up all other calls.
+    `codes`: of each call number; the last is that of all higher ones too."""
     intervals: list[Interval] = []
     for number, code in enumerate(codes):
         if not intervals or intervals[-1][1] != code:

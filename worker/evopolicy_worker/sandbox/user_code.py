@@ -39,8 +39,8 @@ def modules(folder: str) -> list[str]:
 
 
 def content(path: str) -> list[str]:
-    """The paths that are shown of a file or folder: the folder itself if nothing in it is hidden. Raises SandboxError
-    where that are too many files."""
+    """The paths that are shown of a file or folder: the folder itself if nothing in it is hidden. Raises
+    SandboxError where that are too many files."""
     if not os.path.isdir(path):
         return [path]
     shown, whole = _content(path)
@@ -53,7 +53,7 @@ def content(path: str) -> list[str]:
 
 
 def declared(definitions: Iterable[Entry], folders: Sequence[str]) -> list[str]:
-    """The paths shown for these definitions in addition: their data, and their modules, wherever those are installed.
+    """The paths shown for these definitions in addition: their data, and their modules wherever installed.
 
     `folders`: those that are searched for modules before this process's own.
     """

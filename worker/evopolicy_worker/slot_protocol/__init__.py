@@ -1,1 +1,1 @@
-"""The messages of a slot's supervisor and its environment process, and the meaning of each end of a process."""
+"""Messages between a slot's supervisor and its environment process, and the meaning of each end of one."""

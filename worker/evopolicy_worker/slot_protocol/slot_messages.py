@@ -159,16 +159,16 @@ def unframed(received: bytearray) -> list[bytes]:
 
 
 def take_pipes() -> tuple[int, int]:
-    """In a worker's child process: moves standard input and output to new descriptors and returns these, for commands
-    and answers.
+    """In a worker's child process: moves standard input and output to new descriptors and returns these, for
+    commands and answers.
 
     From now on standard input is empty, and prints of simulators and drivers go to standard error. Ctrl-C and SIGTERM
     are ignored; the parent handles them, and this process ends with its parent.
     """
     end_with_parent(signal.SIGKILL)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    # A batch system sends it to all processes of a job. Processes started from here inherit this. So does a policy,
-    # whose failure it would be otherwise.
+    # A batch system sends it to all processes of a job. Processes started from here inherit this. So does a
+    # policy, whose failure it would be otherwise.
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
     commands, replies = os.dup(0), os.dup(1)
     with open(os.devnull) as nothing:

@@ -18,8 +18,8 @@ _locks: list[IO[bytes]] = []
 
 
 def take(n: int | None) -> list[int]:
-    """A core for each of `n` slots: those that no worker of this machine has taken, then all in turn. None: as many
-    slots as this process has cores."""
+    """A core for each of `n` slots: those that no worker of this machine has taken, then all in turn. None:
+    as many slots as this process has cores."""
     allowed = sorted(os.sched_getaffinity(0))
     n = n or len(allowed)
     folder = Path(tempfile.gettempdir()) / f"evopolicy-cores-{os.getuid()}"

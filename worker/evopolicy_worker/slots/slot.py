@@ -284,7 +284,8 @@ class Slot:
         return tuple(descriptions)
 
     def memory_bytes(self) -> int:
-        """Resident memory of all of the slot's processes; each has its part of the memory that several share."""
+        """Resident memory of all of the slot's processes; each has its part of the memory that several
+        share."""
         return 0 if self._process is None else _memory(self._process.pid)
 
     def cpu_s(self) -> float:
@@ -462,5 +463,6 @@ def _error(reply: messages.Reply) -> EvopolicyError:
 def _kill(process: asyncio.subprocess.Process | None) -> None:
     if process is not None:
         with contextlib.suppress(ProcessLookupError):
-            # The whole group: the sandbox dies with its parent, but simulators' helper processes only with the group.
+            # The whole group: the sandbox dies with its parent, but simulators' helper processes only with
+            # the group.
             os.killpg(process.pid, signal.SIGKILL)

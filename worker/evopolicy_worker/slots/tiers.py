@@ -30,8 +30,8 @@ def available_tiers(*, unsandboxed: bool = False, wanted: Collection[str] = SAND
 def why_not(tier: Tier) -> str | None:
     """Why this tier does not work here, with a remedy; None when it works.
 
-    Starts an environment process in its jail, with the policies' sandbox inside. Call it on the main thread, and not
-    from a coroutine.
+    Starts an environment process in its jail, with the policies' sandbox inside. Call it on the main thread,
+    and not from a coroutine.
     """
     with scratch_folder("tier") as folder:
         # A subfolder, as for a slot: this process holds the lock of `folder` itself.

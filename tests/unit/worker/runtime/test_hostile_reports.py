@@ -1,5 +1,5 @@
-"""All bytes from a policy's process are bounded and checked before they are used, and never cost the slot or the
-episode."""
+"""All bytes from a policy's process are bounded and checked before they are used, and never cost the slot or
+the episode."""
 
 from __future__ import annotations
 

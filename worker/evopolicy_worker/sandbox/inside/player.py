@@ -471,7 +471,7 @@ def array_data(array: Any) -> bytes:
 
 
 def pack(value: Any, out: bytearray, depth: int) -> int:
-    """Appends `value` as msgpack, or its type's name where it has no form there. Returns how many values it holds."""
+    """Appends `value` as msgpack, or its type's name where it has no form. Returns its number of values."""
     n = 1
     if depth > MAX_ACTION_DEPTH:
         raise ValueError(f"the action nests deeper than {MAX_ACTION_DEPTH}")
@@ -535,7 +535,7 @@ def reply(tag: int, payload: bytes) -> None:
 
 
 def reply_failure(stage: str, error: BaseException) -> None:
-    """Reports an exception of the policy's own code. The policy may forge its text; it names its own failure only."""
+    """Reports an exception of the policy's code, which may forge its text, but only of its own failure."""
     kind, text, message, missing = None, "", "an exception that cannot be shown", None
     # A hostile exception may raise when it is read; then the parts read so far are reported.
     with contextlib.suppress(BaseException):

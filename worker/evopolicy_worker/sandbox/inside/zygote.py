@@ -218,8 +218,8 @@ def zygote(control: int, namespaces: bool, then: Callable[[int], None]) -> NoRet
     with the same arguments. How a policy ended lies in a page that children do not inherit, from where it is sent.
 
     A request of one byte asks how a process ended (its pidfd, a socket for the answer), one of two asks for a process
-    (the socket that is returned) or, beginning with `q`, for the end. A closed socket asks for the end too: the
-    kernel's kill of a child whose parent dies can come before the child has asked for it.
+    (the socket that is returned) or, beginning with `q`, for the end. A closed socket asks for the end too:
+    the kernel's kill of a child whose parent dies can come before the child has asked for it.
     """
     page = unshared_page()
     how, usage = ctypes.c_void_p(page), ctypes.c_void_p(page + SIGINFO_BYTES)
