@@ -126,7 +126,10 @@ class Outbox:
                 self.emptied.set()
                 self._filled.clear()
                 await self._filled.wait()
-            await self._linger()
+            if self._more_follow() and len(self._results) < MAX_HAND_IN:
+                self._hurried.clear()
+                with contextlib.suppress(TimeoutError):
+                    await asyncio.wait_for(self._hurried.wait(), LINGER_S)
             session = self._session()
             n = 1
             try:
@@ -142,14 +145,6 @@ class Outbox:
             else:
                 for _ in range(n):
                     self._settle()
-
-    async def _linger(self) -> None:
-        if not self._more_follow() or len(self._results) >= MAX_HAND_IN:
-            return
-        self._hurried.clear()
-        with contextlib.suppress(TimeoutError):
-            async with asyncio.timeout(LINGER_S):
-                await self._hurried.wait()
 
     async def _batch(self) -> list[JobResult]:
         """The oldest results that fit into one message, ready to send; their large parts are uploaded."""

@@ -209,11 +209,6 @@ def encoded(frames: Iterable[Frame], rate: int) -> bytes:
     return file.getvalue()
 
 
-def rate_of(max_episode_steps: int) -> int:
-    """Frames a second, by the environment alone, so that videos of one environment run side by side."""
-    return max(MIN_RATE, min(MAX_RATE, max_episode_steps // EPISODE_S))
-
-
 def replay(environment: Environment, case: Case, actions: bytes) -> Iterator[Frame]:
     """The frames of the episode in `actions`, one a row.
 
@@ -239,7 +234,9 @@ def serve(env_id: str, orders: BinaryIO, replies: BinaryIO) -> None:
         try:
             if environment is None:
                 environment = environments.make(env_id, render=True)
-            rate = rate_of(environment.description.max_episode_steps)
+            # By the environment alone, so that its videos run side by side.
+            rate = environment.description.max_episode_steps // EPISODE_S
+            rate = max(MIN_RATE, min(MAX_RATE, rate))
             made = Made(mp4=encoded(replay(environment, order.case, order.actions), rate))
         except Exception as error:
             # Drivers and simulators raise any exception here, and a missing picture is no failure of the episode.
