@@ -9,7 +9,6 @@ from __future__ import annotations
 import importlib
 import time
 from collections.abc import Iterable
-from typing import cast
 
 import msgspec
 import numpy as np
@@ -50,8 +49,7 @@ def defined() -> tuple[Entry, ...]:
 def definition(env_id: str) -> list[str]:
     """The definition of an environment that does not ship, as a command-line argument; an empty list for a shipped
     one."""
-    environment = _defined.get(env_id)
-    return [] if environment is None else [msgspec.json.encode(environment).decode()]
+    return [msgspec.json.encode(_defined[env_id]).decode()] if env_id in _defined else []
 
 
 def make(env_id: str, *, render: bool = False, accelerations: bool | None = None) -> Environment:
@@ -96,14 +94,14 @@ def describe(env_id: str) -> EnvironmentDescription:
         description = measured(environment)
     except WorkerError as error:
         raise type(error)(f"{error}{traced(error.__cause__)}") from error.__cause__
-    left_out, entry = tuple(foreign.left_out.get(env_id, ())), _entry(env_id)
-    if entry.success in left_out:
+    entry, dropped = _entry(env_id), tuple(foreign.dropped.get(env_id, ()))
+    if entry.success in dropped:
         raise WorkerError(
             f"environment {env_id}, step, info[{entry.success!r}]: it is a text; success is true or false"
         )
-    told = {"info_strings": list(entry.info_strings)} if entry.info_strings else {}
+    strings = {"info_strings": list(entry.info_strings)} if entry.info_strings else {}
     description = msgspec.structs.replace(
-        description, definition=description.definition | told, info_left_out=left_out
+        description, definition=description.definition | strings, info_left_out=dropped
     )
     # Not after an exception: it belongs to the call that is running, which its message names.
     environment.close()
@@ -113,8 +111,7 @@ def describe(env_id: str) -> EnvironmentDescription:
 def measured(environment: Environment) -> EnvironmentDescription:
     """The environment's description with the mean time of a few random steps. Plays in it."""
     rng = np.random.default_rng(0)
-    spent, n = 0.0, 0
-    ended = True
+    spent, n, ended = 0.0, 0, True
     while n < _TIMED_STEPS and spent < _TIMED_S:
         if ended:
             environment.reset(Case(seed=n))
@@ -169,9 +166,9 @@ def missing(env_id: str) -> str:
 def check_played(env_ids: Iterable[str]) -> None:
     """Raises ConfigError that names environments which cannot be played here, each with the remedy: eight that are not
     installed and eight that are unknown at most."""
-    lacking = {env_id: what for env_id in env_ids if (what := missing(env_id))}
-    known = [f"{env_id} needs {what}" for env_id, what in lacking.items() if _known(env_id)]
-    texts = [what for env_id, what in lacking.items() if not _known(env_id)]
+    lacking = {env_id: remedy for env_id in env_ids if (remedy := missing(env_id))}
+    known = [f"{env_id} needs {remedy}" for env_id, remedy in lacking.items() if _known(env_id)]
+    texts = [remedy for env_id, remedy in lacking.items() if not _known(env_id)]
     if known:
         texts.append(f"not installed: {'; '.join(known[:8])}")
     if texts:
@@ -192,11 +189,9 @@ def _entry(env_id: str) -> Entry:
     return entry
 
 
-def family_of(found: Entry) -> GymnasiumFamily:
+def family_of(entry: Entry) -> GymnasiumFamily:
     """The family that makes an environment which does not belong to the toys. Imports its module, no simulator."""
-    if found.adapter == "foreign":
-        return foreign.ForeignFamily(found)
-    return cast(
-        GymnasiumFamily,
-        importlib.import_module(f"evopolicy_worker.environments.families.{found.adapter}").FAMILY,
-    )
+    if entry.adapter == "foreign":
+        return foreign.ForeignFamily(entry)
+    family: GymnasiumFamily = importlib.import_module(f"{foreign.__package__}.{entry.adapter}").FAMILY
+    return family

@@ -13,7 +13,7 @@ import pytest
 from evopolicy_worker.environments.browser import page as page_module
 from evopolicy_worker.environments.browser.devtools import BrowserLostError
 from evopolicy_worker.environments.browser.keys import ALT, CONTROL, SHIFT, combined
-from evopolicy_worker.environments.browser.page import Address, Page
+from evopolicy_worker.environments.browser.page import CLICK, Address, Button, Page
 
 pytestmark = pytest.mark.families
 
@@ -211,11 +211,7 @@ def test_there_is_one_window_and_nobody_to_ask(browser: Page, tmp_path: Path) ->
     body = '<a id="new" href="attack.html" target="_blank" style="font-size:60px">new</a>'
     browser.open(address(tmp_path, script, body=body), "1")
     assert browser.run("window.answers") == [None, False, None, None, None]
-    browser.mouse(
-        ("mouseMoved", 30, 40, "left", 0),
-        ("mousePressed", 30, 40, "left", 1),
-        ("mouseReleased", 30, 40, "left", 1),
-    )
+    browser.point(30, 40, *CLICK)
     browser.run("new Promise((done) => done())")
     assert len(pages_of(browser)) == 1
 
@@ -255,9 +251,9 @@ def test_a_page_cannot_be_left_and_says_so(browser: Page, tmp_path: Path, script
 def test_no_click_on_a_link_leads_elsewhere_or_saves_a_file(browser: Page, tmp_path: Path, link: str) -> None:
     body = f'<a {link} style="display:block; width:200px; height:100px">there</a>'
     where = guarded(browser, tmp_path, body=body)
+    button: Button
     for button, modifiers in (("left", 0), ("left", CONTROL), ("left", SHIFT), ("left", ALT), ("middle", 0)):
-        for kind in ("mouseMoved", "mousePressed", "mouseReleased"):
-            browser.mouse((kind, 60, 50, button, 1), modifiers=modifiers)
+        browser.point(60, 50, *CLICK, button=button, modifiers=modifiers)
         browser.run("__evopolicy.advance(200)")
     time.sleep(0.2)
     assert browser.run("[window.here, location.href]") == [1, where]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 from typing import Any
 
@@ -37,15 +38,9 @@ def bits(*values: Any) -> list[str]:
 @pytest.fixture(scope="module", params=["roundabout-v0", "parking-v0"])
 def network(request: pytest.FixtureRequest) -> Any:
     gymnasium.register_envs(highway_env)
-    with pytest.warns() if "roundabout" in request.param else _nothing():
+    with pytest.warns() if "roundabout" in request.param else contextlib.nullcontext():
         env: Any = gymnasium.make(request.param, disable_env_checker=True).unwrapped
     return env.road.network
-
-
-def _nothing() -> Any:
-    import contextlib
-
-    return contextlib.nullcontext()
 
 
 @given(ANY, st.sampled_from([(-1.0, 1.0), (0.0, 20.0), (-math.pi / 4, math.pi / 4), (-6.0, 6.0)]))
@@ -122,10 +117,7 @@ def test_every_estimate_and_bound_of_a_distance_holds(network: Any) -> None:
         centre = (x + rng.uniform(-half, half), y + rng.uniform(-half, half))
         for lane in network.lanes_list():
             shape: Any = highway_closest_lane._shape(lane)
-            kind = (
-                highway_closest_lane._Circular if shape[0] == "circular" else highway_closest_lane._Straight
-            )
-            known = kind(*shape[1:])
+            known = shape[0](*shape[1:])
             exact = lane.distance_with_heading(position, heading)
             estimate = known.estimate(x, y, float(heading))
             assert estimate == -math.inf or abs(estimate - exact) < 1e-9

@@ -22,12 +22,7 @@ import numpy as np
 import pygame
 from gymnasium.envs.box2d.car_racing import SCALE, STATE_H, STATE_W, WINDOW_H, WINDOW_W, ZOOM, CarRacing
 
-from evopolicy_worker.environments.accelerations.car_racing_view import (
-    PANEL_ROWS,
-    ROAD_ROWS,
-    VISIBLE,
-    covers,
-)
+from evopolicy_worker.environments.accelerations.car_racing_road import PANEL_ROWS, ROAD_ROWS, VISIBLE, covers
 from evopolicy_worker.environments.accelerations.specialise import specialise
 
 FONT_SIZE = 42

@@ -8,53 +8,48 @@ generous distance of the canvas, and paints the background as a polygon that is 
 - vertices of the others are computed by the library's operations in its order, and drawn by its calls, in its order;
 - the background is filled instead of drawn as a polygon where that polygon covers the canvas.
 Serves pictures for people too: they are drawn on the same canvas, under the same panel.
+
+The canvas is 1000 × 800 and upside down until it is flipped; the panel with the indicators is painted afterwards over
+what are then its last rows, which are the first ones while the road is drawn.
 """
 
 from __future__ import annotations
 
 import math
+from itertools import product
 from typing import Any
 
 import numpy as np
-from gymnasium.envs.box2d.car_racing import (
-    GRASS_DIM,
-    MAX_SHAPE_DIM,
-    PLAYFIELD,
-    WINDOW_H,
-    WINDOW_W,
-    CarRacing,
-)
+from gymnasium.envs.box2d.car_racing import GRASS_DIM, MAX_SHAPE_DIM, PLAYFIELD, WINDOW_H, WINDOW_W, CarRacing
 from numpy.typing import NDArray
 from pygame import gfxdraw
 from pygame.math import Vector2
 
-from evopolicy_worker.environments.accelerations.car_racing_view import (
-    MARGIN,
-    PANEL_ROWS,
-    ROAD_ROWS,
-    VISIBLE,
-    covers,
-)
 from evopolicy_worker.environments.accelerations.specialise import specialise
 
+PANEL_ROWS = WINDOW_H // 8
+"""Rows under the panel: five units of a fortieth of the height."""
+ROAD_ROWS = WINDOW_H - PANEL_ROWS
+VISIBLE = (0, PANEL_ROWS, WINDOW_W, ROAD_ROWS)
+"""The part of the canvas, before the flip, of which pixels reach the picture: x, y, width, height."""
+MARGIN = 4.0
+"""Pixels. More than rounding to whole pixels and the smoothing of edges can reach."""
 _LEFT, _RIGHT = -MARGIN, WINDOW_W + MARGIN
 _TOP, _BOTTOM = PANEL_ROWS - MARGIN, WINDOW_H + MARGIN
 _FAR_RIGHT, _FAR_BOTTOM = WINDOW_W + MAX_SHAPE_DIM, WINDOW_H + MAX_SHAPE_DIM
 """The library's own bounds, within which one of the vertices must be."""
 
 
-def _grass() -> list[list[tuple[float, float]]]:
-    """The library's patches, in its order."""
-    return [
-        [
-            (GRASS_DIM * x + GRASS_DIM, GRASS_DIM * y + 0),
-            (GRASS_DIM * x + 0, GRASS_DIM * y + 0),
-            (GRASS_DIM * x + 0, GRASS_DIM * y + GRASS_DIM),
-            (GRASS_DIM * x + GRASS_DIM, GRASS_DIM * y + GRASS_DIM),
-        ]
-        for x in range(-20, 20, 2)
-        for y in range(-20, 20, 2)
-    ]
+def covers(zoom: float, translation: tuple[float, float], angle: float) -> bool:
+    """Whether the playing field, the first polygon to be drawn, covers the canvas with MARGIN to spare on every
+    side."""
+    cos, sin = math.cos(angle), math.sin(angle)
+    for corner_x, corner_y in product((_LEFT, _RIGHT), (-MARGIN, _BOTTOM)):
+        x, y = corner_x - translation[0], corner_y - translation[1]
+        # Rotated back, into the axes of the field.
+        if max(abs(x * cos + y * sin), abs(y * cos - x * sin)) >= PLAYFIELD * zoom:
+            return False
+    return True
 
 
 class _Polygons:
@@ -64,11 +59,8 @@ class _Polygons:
         self.vertices = [[Vector2(vertex) for vertex in polygon] for polygon in polygons]
         corners = np.array([list(polygon) for polygon in polygons], dtype=np.float64)
         centres = corners.mean(axis=1)
-        self._x: NDArray[np.float64] = np.ascontiguousarray(centres[:, 0])
-        self._y: NDArray[np.float64] = np.ascontiguousarray(centres[:, 1])
-        self._radius: NDArray[np.float64] = np.sqrt(
-            ((corners - centres[:, None]) ** 2).sum(axis=2).max(axis=1)
-        )
+        self._x, self._y = np.ascontiguousarray(centres.T)
+        self._radius: NDArray[np.float64] = np.linalg.norm(corners - centres[:, None], axis=2).max(axis=1)
 
     def near(self, zoom: float, translation: tuple[float, float], angle: float) -> list[int]:
         """Indices of those whose circles reach the visible part of the canvas, ascending."""
@@ -77,11 +69,20 @@ class _Polygons:
         x = self._x * cos - self._y * sin + (translation[0] - WINDOW_W / 2)
         y = self._x * sin + self._y * cos + (translation[1] - PANEL_ROWS - ROAD_ROWS / 2)
         inside = (np.abs(x) < reach + WINDOW_W / 2) & (np.abs(y) < reach + ROAD_ROWS / 2)
-        found: list[int] = np.flatnonzero(inside).tolist()
-        return found
+        indices: list[int] = np.flatnonzero(inside).tolist()
+        return indices
 
 
-_GRASS = _Polygons(_grass())
+_GRASS = _Polygons(
+    [
+        [
+            (GRASS_DIM * x + GRASS_DIM * right, GRASS_DIM * y + GRASS_DIM * up)
+            for right, up in ((1, 0), (0, 0), (0, 1), (1, 1))
+        ]
+        for x, y in product(range(-20, 20, 2), repeat=2)
+    ]
+)
+"""The library's patches, in its order."""
 
 
 class VisibleRoad(CarRacing):
@@ -99,21 +100,15 @@ class VisibleRoad(CarRacing):
         if covers(zoom, translation, angle):
             surface.fill(self.bg_color, VISIBLE)
         else:
-            field = [
-                (PLAYFIELD, PLAYFIELD),
-                (PLAYFIELD, -PLAYFIELD),
-                (-PLAYFIELD, -PLAYFIELD),
-                (-PLAYFIELD, PLAYFIELD),
-            ]
+            field = [(PLAYFIELD * x, PLAYFIELD * y) for x, y in ((1, 1), (1, -1), (-1, -1), (-1, 1))]
             draw: Any = self._draw_colored_polygon
             draw(surface, field, self.bg_color, zoom, translation, angle, clip=False)
         for index in _GRASS.near(zoom, translation, angle):
             _draw(surface, _GRASS.vertices[index], self.grass_color, zoom, translation, angle)
-        tiles = self._tiles
-        for index in tiles.near(zoom, translation, angle):
+        for index in self._tiles.near(zoom, translation, angle):
             # A tile's color changes when the car touches it.
             color = [int(c) for c in self.road_poly[index][1]]
-            _draw(surface, tiles.vertices[index], color, zoom, translation, angle)
+            _draw(surface, self._tiles.vertices[index], color, zoom, translation, angle)
 
 
 def _draw(

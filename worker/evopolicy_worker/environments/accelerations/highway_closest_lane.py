@@ -19,7 +19,7 @@ from highway_env.road.lane import CircularLane, SineLane, StraightLane
 from highway_env.road.road import RoadNetwork
 
 from evopolicy_worker.environments.accelerations.highway_arithmetic import PI, TWO_PI, wrap
-from evopolicy_worker.environments.accelerations.highway_scene import Scene, take_over
+from evopolicy_worker.environments.accelerations.highway_scene import prepare
 from evopolicy_worker.environments.accelerations.specialise import specialise
 
 CELL = 2.0
@@ -34,26 +34,21 @@ _REACH = 1e5
 """Metres from the origin within which the error of estimates is known."""
 
 Index = tuple[str, str, int]
+Pair = tuple[float, float]
 Shape = tuple[Any, ...]
+"""The class of a lane's estimates, and its arguments."""
 
 
 class _Straight:
     """A straight lane or, with an amplitude, a sine lane."""
 
     def __init__(
-        self,
-        start: tuple[float, float],
-        along: tuple[float, float],
-        across: tuple[float, float],
-        length: float,
-        heading: float,
-        wave: tuple[float, float, float],
+        self, start: Pair, along: Pair, across: Pair, length: float, heading: float, *wave: float
     ) -> None:
-        self._start_x, self._start_y = start
-        self._along_x, self._along_y = along
+        (self._start_x, self._start_y), (self._along_x, self._along_y) = start, along
         self._across_x, self._across_y = across
         self._length, self._heading = length, heading
-        self._amplitude, self._pulsation, self._phase = wave
+        self._amplitude, self._pulsation, self._phase = wave or (0.0, 0.0, 0.0)
 
     def bound(self, x: float, y: float) -> float:
         """Least distance from the cell around (x, y)."""
@@ -83,9 +78,7 @@ class _Straight:
 class _Circular:
     """A circular lane."""
 
-    def __init__(
-        self, centre: tuple[float, float], radius: float, start: float, length: float, direction: int
-    ) -> None:
+    def __init__(self, centre: Pair, radius: float, start: float, length: float, direction: float) -> None:
         self._x, self._y = centre
         self._radius, self._start, self._length, self._direction = radius, start, length, direction
         end = start + direction * length / radius
@@ -120,11 +113,9 @@ class _Map:
     """All lanes of a network, sorted by their bounds in every cell that was visited."""
 
     def __init__(self, shapes: tuple[Shape, ...]) -> None:
-        self._lanes = [
-            _Circular(*shape[1:]) if shape[0] == "circular" else _Straight(*shape[1:]) for shape in shapes
-        ]
+        self._lanes = [kind(*numbers) for kind, *numbers in shapes]
         self._all = [(-math.inf, index) for index in range(len(shapes))] if len(shapes) <= _FEW else None
-        self._cells: dict[tuple[float, float], list[tuple[float, int]]] = {}
+        self._cells: dict[Pair, list[tuple[float, int]]] = {}
 
     def closest(self, x: float, y: float, heading: float) -> int | None:
         """Position of the closest lane in the list; None where it is too close a thing."""
@@ -144,7 +135,7 @@ class _Map:
         # A lane that was not looked at is further than its bound, which has DOUBT to spare.
         return closest if best >= 0 and second - best > DOUBT else None
 
-    def _cell(self, key: tuple[float, float]) -> list[tuple[float, int]]:
+    def _cell(self, key: Pair) -> list[tuple[float, int]]:
         x, y = (key[0] + 0.5) * CELL, (key[1] + 0.5) * CELL
         cell = sorted((lane.bound(x, y), index) for index, lane in enumerate(self._lanes))
         if len(self._cells) >= _MAX_CELLS:
@@ -175,49 +166,31 @@ class MappedNetwork(RoadNetwork):  # type: ignore[misc]
         return index
 
 
-class ClosestLanes(Scene):
-    """An environment of which the road network is mapped."""
-
-    def _road_made(self) -> None:
-        super()._road_made()
-        network = self.road.network
-        shapes = [_shape(lane) for lane in network.lanes_list()]
-        if None not in shapes:
-            specialise(network, MappedNetwork)
-            network._map = _map(tuple(shapes))
-            network._indexes = list(network.lanes_dict())
+def _map_network(env: Any) -> None:
+    network = env.road.network
+    shapes = [_shape(lane) for lane in network.lanes_list()]
+    if None not in shapes:
+        specialise(network, MappedNetwork)
+        network._map = _map(tuple(shapes))
+        network._indexes = list(network.lanes_dict())
 
 
 def _shape(lane: Any) -> Shape | None:
     """The numbers of a lane that determine distances; None for a kind without an estimate."""
     if isinstance(lane, CircularLane):
-        return (
-            "circular",
-            _pair(lane.center),
-            float(lane.radius),
-            float(lane.start_phase),
-            float(lane.length),
-            int(lane.direction),
-        )
+        numbers = lane.radius, lane.start_phase, lane.length, lane.direction
+        return _Circular, _floats(lane.center), *_floats(numbers)
     if isinstance(lane, StraightLane):
-        sine = isinstance(lane, SineLane)
-        wave = (float(lane.amplitude), float(lane.pulsation), float(lane.phase)) if sine else (0.0, 0.0, 0.0)
-        return (
-            "straight",
-            _pair(lane.start),
-            _pair(lane.direction),
-            _pair(lane.direction_lateral),
-            float(lane.length),
-            float(lane.heading),
-            wave,
-        )
+        wave = (lane.amplitude, lane.pulsation, lane.phase) if isinstance(lane, SineLane) else ()
+        places = map(_floats, (lane.start, lane.direction, lane.direction_lateral))
+        return _Straight, *places, *_floats((lane.length, lane.heading, *wave))
     return None
 
 
-def _pair(values: Any) -> tuple[float, float]:
-    return float(values[0]), float(values[1])
+def _floats(values: Any) -> tuple[float, ...]:
+    return tuple(map(float, values))
 
 
 def accelerate(env: Any) -> None:
     """Map the roads of this bare highway-env environment."""
-    take_over(env, ClosestLanes)
+    prepare(env, _map_network)

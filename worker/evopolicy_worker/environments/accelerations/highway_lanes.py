@@ -17,7 +17,7 @@ from highway_env.envs.racetrack_env import RacetrackEnv
 from highway_env.road.lane import AbstractLane, CircularLane, SineLane, StraightLane
 
 from evopolicy_worker.environments.accelerations.highway_arithmetic import PI, wrap
-from evopolicy_worker.environments.accelerations.highway_scene import Scene, take_over
+from evopolicy_worker.environments.accelerations.highway_scene import prepare
 from evopolicy_worker.environments.accelerations.specialise import specialise
 
 _REMEMBERED = 256
@@ -64,8 +64,8 @@ class AskewLane(Remembering, StraightLane):  # type: ignore[misc]
     """A straight lane in any direction."""
 
     def _compute(self, position: Any, x: float, y: float) -> Coordinates:
-        found: Coordinates = StraightLane.local_coordinates(self, position)
-        return found
+        coordinates: Coordinates = StraightLane.local_coordinates(self, position)
+        return coordinates
 
 
 class AxisLane(Remembering, StraightLane):  # type: ignore[misc]
@@ -118,31 +118,17 @@ class RacingCircularLane(ScalarCircularLane):
         return np.float64(longitudinal), np.float64(lateral)
 
 
-class ScalarLanes(Scene):
-    """An environment of which the lanes remember."""
-
-    def _road_made(self) -> None:
-        for lane in self.road.network.lanes_list():
-            quicken(lane, races=isinstance(self, RacetrackEnv))
-        super()._road_made()
-
-
 def quicken(lane: Any, *, races: bool = False) -> None:
     """Give a lane the methods above, if it is of a kind that has them."""
     kind = type(lane)
-    if kind in (StraightLane, SineLane):
-        if not (_on_axis(lane.direction) and _on_axis(lane.direction_lateral)):
-            if kind is SineLane:
-                return
-            specialise(lane, AskewLane)
-            lane._known = {}
-            return
-        specialise(lane, AxisSineLane if kind is SineLane else AxisLane)
-        origin = (*lane.start, *lane.direction, *lane.direction_lateral)
-        lane._origin = tuple(float(value) for value in origin)
-    elif kind is CircularLane:
+    if kind is CircularLane:
         specialise(lane, RacingCircularLane if races else ScalarCircularLane)
         lane._start = float(lane.start_phase)
+    elif kind in (StraightLane, SineLane) and _on_axis(lane.direction) and _on_axis(lane.direction_lateral):
+        specialise(lane, AxisSineLane if kind is SineLane else AxisLane)
+        lane._origin = tuple(map(float, (*lane.start, *lane.direction, *lane.direction_lateral)))
+    elif kind is StraightLane:
+        specialise(lane, AskewLane)
     else:
         return
     lane._known = {}
@@ -154,4 +140,9 @@ def _on_axis(direction: Any) -> bool:
 
 def accelerate(env: Any) -> None:
     """Quicken the lanes of this bare highway-env environment."""
-    take_over(env, ScalarLanes)
+    prepare(env, _quicken_all)
+
+
+def _quicken_all(env: Any) -> None:
+    for lane in env.road.network.lanes_list():
+        quicken(lane, races=isinstance(env, RacetrackEnv))

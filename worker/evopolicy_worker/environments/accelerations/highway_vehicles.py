@@ -32,7 +32,7 @@ from highway_env.vehicle.objects import Landmark
 
 from evopolicy_worker.environments.accelerations.highway_arithmetic import PI, clip, not_zero, wrap
 from evopolicy_worker.environments.accelerations.highway_lanes import Remembering
-from evopolicy_worker.environments.accelerations.highway_scene import Scene, take_over
+from evopolicy_worker.environments.accelerations.highway_scene import prepare
 from evopolicy_worker.environments.accelerations.specialise import specialise
 
 DOUBT = 1e-6
@@ -75,24 +75,6 @@ class ScalarControlled(ControlledVehicle):  # type: ignore[misc]
         slip = float(np.arcsin(clip(self.LENGTH / 2 / nonzero_speed * rate_command, -1.0, 1.0)))
         steering = float(np.arctan(2 * np.tan(slip)))
         return clip(steering, -self.MAX_STEERING_ANGLE, self.MAX_STEERING_ANGLE)
-
-
-class ScalarMDP(ScalarControlled, MDPVehicle):  # type: ignore[misc]
-    """The vehicle that the policy drives in roundabout."""
-
-    def act(self, action: Any = None) -> None:
-        if action is not None:
-            super().act(action)
-            return
-        # The library's two calls up, with nothing to change but the controls.
-        self.follow_road()
-        Vehicle.act(
-            self,
-            {
-                "steering": self.steering_control(self.target_lane_index),
-                "acceleration": self.speed_control(self.target_speed),
-            },
-        )
 
 
 class ScalarIDM(ScalarControlled, IDMVehicle):  # type: ignore[misc]
@@ -140,13 +122,9 @@ class ScalarIDM(ScalarControlled, IDMVehicle):  # type: ignore[misc]
         if projected:
             front_speed, front_heading = float(front_vehicle.speed), front_vehicle.heading
             cos, sin = np.cos(ego_vehicle.heading), np.sin(ego_vehicle.heading)
-            relative = np.array(
-                (
-                    speed * cos - front_speed * np.cos(front_heading),
-                    speed * sin - front_speed * np.sin(front_heading),
-                )
-            )
-            approach = float(relative.dot(np.array((cos, sin))))
+            x = speed * cos - front_speed * np.cos(front_heading)
+            y = speed * sin - front_speed * np.sin(front_heading)
+            approach = float(np.array((x, y)).dot(np.array((cos, sin))))
         else:
             approach = speed - float(front_vehicle.speed)
         braking = -self.COMFORT_ACC_MAX * self.COMFORT_ACC_MIN
@@ -164,12 +142,12 @@ class ScalarRoad(Road):  # type: ignore[misc]
     def act(self) -> None:
         for vehicle in self.vehicles:
             quicken(vehicle)
-        self._look()
+        self._note_places()
         self._sorted = {}
         super().act()
         self._sorted = None
 
-    def _look(self) -> None:
+    def _note_places(self) -> None:
         things = self.vehicles + [each for each in self.objects if not isinstance(each, Landmark)]
         self._things = [(each, each.position, *each.position.tolist()) for each in things]
 
@@ -180,7 +158,7 @@ class ScalarRoad(Road):  # type: ignore[misc]
         s = self.network.get_lane(lane_index).local_coordinates(vehicle.position)[0]
         known = self._sorted
         if known is None:
-            self._look()
+            self._note_places()
             known = {}
         if lane_index not in known:
             known[lane_index] = self._along(lane_index)
@@ -206,12 +184,11 @@ class ScalarRoad(Road):  # type: ignore[misc]
         lanes = [(lane, 0.0)]
         if self.neighbour_vehicles_connected_lanes:
             begin, end, k = lane_index
-            after = [lanes for lanes in graph.get(end, {}).values() if lanes]
-            before = [ends[begin] for ends in graph.values() if ends.get(begin)]
-            lanes += [(each[k] if k < len(each) else each[0], lane.length) for each in after]
-            joining = [each[k] if k < len(each) else each[0] for each in before]
-            lanes += [(each, -each.length) for each in joining]
-        found = []
+            after = [each[k] if k < len(each) else each[0] for each in graph.get(end, {}).values() if each]
+            joined = [ends[begin] for ends in graph.values() if ends.get(begin)]
+            before = [each[k] if k < len(each) else each[0] for each in joined]
+            lanes += [*((each, lane.length) for each in after), *((each, -each.length) for each in before)]
+        along = []
         for thing, position, x, y in self._things:
             for each, offset in lanes:
                 remembers = isinstance(each, Remembering)
@@ -219,10 +196,10 @@ class ScalarRoad(Road):  # type: ignore[misc]
                 if -each.VEHICLE_LENGTH <= s < each.length + each.VEHICLE_LENGTH and (
                     abs(lateral) <= each.width_at(s) / 2 + 1
                 ):
-                    found.append((s + offset, thing))
+                    along.append((s + offset, thing))
                     break
-        found.sort(key=itemgetter(0))
-        return [s for s, _ in found], [thing for _, thing in found]
+        along.sort(key=itemgetter(0))
+        return [s for s, _ in along], [thing for _, thing in along]
 
 
 class ScalarCrossing(ScalarRoad, RegulatedRoad):  # type: ignore[misc]
@@ -263,23 +240,16 @@ _ALONE = FunctionType(
     Vehicle.predict_trajectory_constant_speed.__code__,
     {**vars(kinematics), "copy": SimpleNamespace(deepcopy=copy.copy)},
 )
-_KINDS: dict[type[Any], type[Any]] = {
-    MDPVehicle: ScalarMDP,
-    IDMVehicle: ScalarIDM,
-}
+_KINDS: dict[type[Any], type[Any]] = {MDPVehicle: ScalarControlled, IDMVehicle: ScalarIDM}
 
 
-class ScalarTraffic(Scene):
-    """An environment of which the vehicles calculate in scalars."""
+def _make_road_scalar(env: Any) -> None:
+    specialise(env.road, ScalarCrossing if isinstance(env.road, RegulatedRoad) else ScalarRoad)
 
-    def _road_made(self) -> None:
-        super()._road_made()
-        specialise(self.road, ScalarCrossing if isinstance(self.road, RegulatedRoad) else ScalarRoad)
 
-    def _vehicles_made(self) -> None:
-        super()._vehicles_made()
-        for vehicle in self.road.vehicles:
-            quicken(vehicle)
+def _quicken_all(env: Any) -> None:
+    for vehicle in env.road.vehicles:
+        quicken(vehicle)
 
 
 def quicken(vehicle: Any) -> None:
@@ -294,4 +264,4 @@ def quicken(vehicle: Any) -> None:
 
 def accelerate(env: Any) -> None:
     """Quicken the vehicles of this bare highway-env environment."""
-    take_over(env, ScalarTraffic)
+    prepare(env, _make_road_scalar, _quicken_all)

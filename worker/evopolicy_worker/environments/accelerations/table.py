@@ -48,113 +48,84 @@ class Acceleration:
     def serves(self, gymnasium_id: str) -> bool:
         return gymnasium_id in self.gymnasium_ids
 
-    def holds(self) -> bool:
-        """Whether the module's own check of this machine passes, if it has one. Logs a warning once when it does
-        not."""
-        if not self.checks or self._module().holds():
-            return True
-        if self.name not in _reported:
-            _reported.add(self.name)
-            _warn("not exact on this machine", acceleration=self.name)
-        return False
-
-    def apply(self, env: Any) -> None:
-        self._module().accelerate(env)
-
-    def _module(self) -> Any:
+    def module(self) -> Any:
         return importlib.import_module(f"{__package__}.{self.name}")
 
+    def fault(self) -> tuple[str, dict[str, str]]:
+        """Why it may not be used here, and the installed versions that are not proved; an empty text when it may."""
+        installed = {name: _version(name) for name in self.distributions}
+        unproved = {name: found for name, found in installed.items() if found not in PROVED[name]}
+        if unproved:
+            return "not proved with the installed version", unproved
+        return "" if not self.checks or self.module().holds() else "not exact on this machine", {}
 
-_MINIGRID = (
-    "MiniGrid-DoorKey-16x16-v0",
-    "MiniGrid-FourRooms-v0",
-    "MiniGrid-KeyCorridorS4R3-v0",
-    "MiniGrid-ObstructedMaze-1Q-v1",
-)
-_HIGHWAY = (
-    *(
-        f"{name}-v{version}"
-        for name in (
-            *("exit", "merge", "merge-generic", "racetrack", "racetrack-large", "racetrack-oval"),
-            *("roundabout", "roundabout-generic", "u-turn"),
-        )
-        for version in (0, 1)
-    ),
-    *("highway-fast-v0", "highway-v0", "intersection-v0", "intersection-v1", "intersection-v2"),
-    *(
-        "intersection-multi-agent-v0",
-        "parking-ActionRepeat-v0",
-        "parking-parked-v0",
-        "parking-v0",
-        "two-way-v0",
-    ),
-)
+
+_MINIGRID = "DoorKey-16x16-v0 FourRooms-v0 KeyCorridorS4R3-v0 ObstructedMaze-1Q-v1"
+_HIGHWAY = """
+    exit-v0 exit-v1 highway-fast-v0 highway-v0 intersection-multi-agent-v0 intersection-v0 intersection-v1
+    intersection-v2 merge-generic-v0 merge-generic-v1 merge-v0 merge-v1 parking-ActionRepeat-v0 parking-parked-v0
+    parking-v0 racetrack-large-v0 racetrack-large-v1 racetrack-oval-v0 racetrack-oval-v1 racetrack-v0 racetrack-v1
+    roundabout-generic-v0 roundabout-generic-v1 roundabout-v0 roundabout-v1 two-way-v0 u-turn-v0 u-turn-v1
+"""
 """All of the family but `lane-keeping-v0`; 128 seeds of each were compared."""
 
-_MUJOCO = ("HalfCheetah-v5", "Pusher-v5", "Reacher-v5")
+
+def _road(name: str, *distributions: str) -> Acceleration:
+    return Acceleration(f"highway_{name}", tuple(_HIGHWAY.split()), ("highway-env", *distributions))
+
 
 ACCELERATIONS: tuple[Acceleration, ...] = (
     Acceleration("acrobot_scalars", ("Acrobot-v1",), ("gymnasium", "numpy"), checks=True),
-    Acceleration("mujoco_state", _MUJOCO, ("gymnasium", "mujoco", "numpy")),
+    Acceleration(
+        "mujoco_state", ("HalfCheetah-v5", "Pusher-v5", "Reacher-v5"), ("gymnasium", "mujoco", "numpy")
+    ),
     Acceleration("car_racing_road", ("CarRacing-v3",), ("gymnasium", "pygame-ce")),
     Acceleration("car_racing_frame", ("CarRacing-v3",), ("gymnasium", "pygame-ce"), checks=True),
-    Acceleration("minigrid_view", _MINIGRID, ("minigrid",)),
-    Acceleration("highway_lanes", _HIGHWAY, ("highway-env", "numpy")),
-    Acceleration("highway_closest_lane", _HIGHWAY, ("highway-env",)),
-    Acceleration("highway_collisions", _HIGHWAY, ("highway-env",)),
-    Acceleration("highway_vehicles", _HIGHWAY, ("highway-env", "numpy")),
-    Acceleration("highway_observations", _HIGHWAY, ("highway-env", "numpy")),
+    Acceleration("minigrid_view", tuple(f"MiniGrid-{name}" for name in _MINIGRID.split()), ("minigrid",)),
+    _road("lanes", "numpy"),
+    _road("closest_lane"),
+    _road("collisions"),
+    _road("vehicles", "numpy"),
+    _road("observations", "numpy"),
 )
 """In order of application."""
 
 
 def accelerate(gymnasium_id: str, env: Any) -> list[str]:
     """Applies all usable accelerations that serve this environment to a bare one. Returns their names, in order."""
-    applied = []
-    for acceleration in ACCELERATIONS:
-        if acceleration.serves(gymnasium_id) and usable(acceleration) and acceleration.holds():
-            acceleration.apply(env)
-            applied.append(acceleration.name)
-    return applied
+    applied = [one for one in ACCELERATIONS if one.serves(gymnasium_id) and usable(one)]
+    for acceleration in applied:
+        acceleration.module().accelerate(env)
+    return [one.name for one in applied]
 
 
 def off() -> dict[str, str]:
     """Why accelerations of installed libraries are not in use here, by their names. Imports simulators."""
-    found = {}
+    reasons = {}
     for one in ACCELERATIONS:
-        unproved = _unproved(one)
-        if unproved and "none" not in unproved.values():
-            proved = (f"{name} {own}, proved: {', '.join(PROVED[name])}" for name, own in unproved.items())
-            found[one.name] = "; ".join(proved)
-        elif not unproved and not one.holds():
-            found[one.name] = "not exact on this machine"
-    return found
-
-
-def _unproved(acceleration: Acceleration) -> dict[str, str]:
-    installed = {name: _version(name) for name in acceleration.distributions}
-    return {name: found for name, found in installed.items() if found not in PROVED[name]}
+        why, unproved = one.fault()
+        if why and "none" not in unproved.values():
+            versions = (f"{name} {own}, proved: {', '.join(PROVED[name])}" for name, own in unproved.items())
+            reasons[one.name] = "; ".join(versions) or why
+    return reasons
 
 
 def usable(acceleration: Acceleration) -> bool:
-    """Whether the installed versions are proved ones. Logs a warning, once per acceleration, when they are not."""
-    unproved = _unproved(acceleration)
-    if unproved and acceleration.name not in _reported:
+    """Whether the installed versions are proved ones, and the module's own check of this machine passes. Logs a
+    warning, once per acceleration, when not."""
+    why, unproved = acceleration.fault()
+    if why and acceleration.name not in _reported:
         _reported.add(acceleration.name)
-        _warn(
-            "not proved with the installed version",
-            acceleration=acceleration.name,
-            installed=unproved,
-            proved={name: PROVED[name] for name in unproved},
+        # Imported late: every slot's process imports this module, and structlog would be a fifth of its imports.
+        from evopolicy_common.logs import structlog
+
+        about = (
+            {"installed": unproved, "proved": {name: PROVED[name] for name in unproved}} if unproved else {}
         )
-    return not unproved
-
-
-def _warn(why: str, **about: Any) -> None:
-    # Imported late: every slot's process imports this module, and structlog would be a fifth of its imports.
-    from evopolicy_common.logs import structlog
-
-    structlog.get_logger(__name__).warning(f"acceleration is off: {why}", **about)
+        structlog.get_logger(__name__).warning(
+            f"acceleration is off: {why}", acceleration=acceleration.name, **about
+        )
+    return not why
 
 
 def _version(distribution: str) -> str:

@@ -11,48 +11,49 @@ from typing import Any
 MAX_CALLS = 32
 """Of one action."""
 MAX_NUMBER = 1e6
-_NUMBER = (int, float)
-BID = {"bid": str}
-_POINT: dict[str, Any] = {"x": _NUMBER, "y": _NUMBER}
-_BUTTON = {"button": ("left", str), "modifiers": ([], list)}
-SIGNATURES: Mapping[str, Mapping[str, Any]] = {
-    "noop": {"wait_ms": (1000, _NUMBER)},
-    "send_msg_to_user": {"text": str},
-    "report_infeasible": {"reason": str},
-    "scroll": {"delta_x": _NUMBER, "delta_y": _NUMBER},
-    "fill": {**BID, "value": str},
-    "select_option": {**BID, "options": (str, list)},
-    "check": BID,
-    "uncheck": BID,
-    "click": {**BID, **_BUTTON},
-    "dblclick": {**BID, **_BUTTON},
-    "hover": BID,
-    "press": {**BID, "key_comb": str},
-    "focus": BID,
-    "clear": BID,
-    "drag_and_drop": {"from_bid": str, "to_bid": str},
-    "mouse_move": _POINT,
-    "mouse_up": {**_POINT, "button": ("left", str)},
-    "mouse_down": {**_POINT, "button": ("left", str)},
-    "mouse_click": {**_POINT, "button": ("left", str)},
-    "mouse_dblclick": {**_POINT, "button": ("left", str)},
-    "mouse_drag_and_drop": {"from_x": _NUMBER, "from_y": _NUMBER, "to_x": _NUMBER, "to_y": _NUMBER},
-    "keyboard_down": {"key": str},
-    "keyboard_up": {"key": str},
-    "keyboard_press": {"key": str},
-    "keyboard_type": {"text": str},
-    "keyboard_insert_text": {"text": str},
+SIGNATURES: Mapping[str, tuple[str, ...]] = {
+    name: tuple(arguments.split())
+    for name, arguments in {
+        "noop": "wait_ms",
+        "send_msg_to_user": "text",
+        "report_infeasible": "reason",
+        "scroll": "delta_x delta_y",
+        "fill": "bid value",
+        "select_option": "bid options",
+        "check": "bid",
+        "uncheck": "bid",
+        "click": "bid button modifiers",
+        "dblclick": "bid button modifiers",
+        "hover": "bid",
+        "press": "bid key_comb",
+        "focus": "bid",
+        "clear": "bid",
+        "drag_and_drop": "from_bid to_bid",
+        "mouse_move": "x y",
+        "mouse_up": "x y button",
+        "mouse_down": "x y button",
+        "mouse_click": "x y button",
+        "mouse_dblclick": "x y button",
+        "mouse_drag_and_drop": "from_x from_y to_x to_y",
+        "keyboard_down": "key",
+        "keyboard_up": "key",
+        "keyboard_press": "key",
+        "keyboard_type": "text",
+        "keyboard_insert_text": "text",
+    }.items()
 }
-"""By function, its arguments in order: their types, or a default and their types. A default's types include None."""
+"""By function, the names of its arguments in order."""
+DEFAULTS: Mapping[str, Any] = {"wait_ms": 1000, "button": "left", "modifiers": []}
+_NUMBERS = ["wait_ms", "x", "y", "delta_x", "delta_y", "from_x", "from_y", "to_x", "to_y"]
+_TYPES: Mapping[str, Any] = {
+    **dict.fromkeys(_NUMBERS, int | float),
+    "options": str | list,
+    "modifiers": list,
+}
+"""Of arguments by their names; all others are texts."""
 ELSEWHERE = (
-    "goto",
-    "go_back",
-    "go_forward",
-    "new_tab",
-    "tab_close",
-    "tab_focus",
-    "upload_file",
-    "mouse_upload_file",
+    *("goto", "go_back", "go_forward", "new_tab", "tab_close", "tab_focus"),
+    *("upload_file", "mouse_upload_file"),
 )
 """BrowserGym's actions that leave the page, which these tasks never need."""
 
@@ -69,16 +70,13 @@ def calls(text: str) -> list[tuple[str, dict[str, Any]]]:
     """The calls of an action, in order: functions and their arguments by name. As BrowserGym does, it finds them
     anywhere in the text, skips comments and the words in between, and lets a text have several lines. ValueError, in
     words, for an action without calls."""
-    found = [
-        (match[1], given)
-        for match in _CALL.finditer(text)
-        if match[1] and (given := _given(match[2])) is not None
-    ]
-    if not found:
+    matches = [match for match in _CALL.finditer(text) if match[1]]
+    given = [(match[1], each) for match in matches if (each := _given(match[2])) is not None]
+    if not given:
         raise ValueError(f"Received an empty action: there is no function call in {text[:200]!r}")
-    if len(found) > MAX_CALLS:
-        raise ValueError(f"Received {len(found)} calls; {MAX_CALLS} are the limit")
-    return [(name, _arguments(name, *given)) for name, given in found]
+    if len(given) > MAX_CALLS:
+        raise ValueError(f"Received {len(given)} calls; {MAX_CALLS} are the limit")
+    return [(name, _arguments(name, *each)) for name, each in given]
 
 
 def _given(text: str) -> tuple[list[Any], dict[str, Any]] | None:
@@ -100,27 +98,22 @@ def _arguments(name: str, given: list[Any], named: dict[str, Any]) -> dict[str, 
         why = "leaves the page" if name in ELSEWHERE else "does not exist"
         raise ValueError(f"Invalid action type '{name}': it {why}; there are {', '.join(SIGNATURES)}.")
     wanted = SIGNATURES[name]
-    if len(given) > len(wanted) or not named.keys() <= wanted.keys():
+    if len(given) > len(wanted) or not named.keys() <= set(wanted):
         raise ValueError(f"{name} takes {', '.join(wanted)}; it was given {[*given, *named]}")
-    all_given = dict(zip(wanted, given, strict=False)) | named
-    return {each: _argument(name, each, parameter, all_given) for each, parameter in wanted.items()}
+    values = {**DEFAULTS, **dict(zip(wanted, given, strict=False)), **named}
+    for argument in wanted:
+        if argument not in values:
+            raise ValueError(f"{name}() misses its argument {argument!r}")
+        if not _is_of_type(argument, values[argument]):
+            raise ValueError(f"{name}: {argument} is {values[argument]!r}, which is not of the right type")
+    return {argument: values[argument] for argument in wanted}
 
 
-def _argument(name: str, argument: str, parameter: Any, given: Mapping[str, Any]) -> Any:
-    has_default = isinstance(parameter, tuple) and not isinstance(parameter[0], type)
-    types = parameter[1] if has_default else parameter
-    if argument not in given:
-        if has_default:
-            return parameter[0]
-        raise ValueError(f"{name}() misses its argument {argument!r}")
-    value = given[argument]
-    numbers = isinstance(value, int | float) and not abs(value) <= MAX_NUMBER
-    texts = value if isinstance(value, list) else [value]
-    unwritable = any(isinstance(each, str) and not each.isascii() and _has_surrogates(each) for each in texts)
-    if not isinstance(value, types) or isinstance(value, bool) or numbers or unwritable:
-        raise ValueError(f"{name}: {argument} is {value!r}, which is not of the right type")
-    return value
-
-
-def _has_surrogates(text: str) -> bool:
-    return any("\ud800" <= character <= "\udfff" for character in text)
+def _is_of_type(argument: str, value: Any) -> bool:
+    if not isinstance(value, _TYPES.get(argument, str)) or isinstance(value, bool):
+        return False
+    if isinstance(value, int | float):
+        return abs(value) <= MAX_NUMBER  # false for NaN
+    texts = [each for each in (value if isinstance(value, list) else [value]) if isinstance(each, str)]
+    # Half of a surrogate pair cannot be sent to the browser.
+    return not any("\ud800" <= character <= "\udfff" for text in texts for character in text)

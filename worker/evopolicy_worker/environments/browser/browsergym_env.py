@@ -28,6 +28,7 @@ MAX_JSON = 1 << 22
 MAX_WAIT_MS = 10_000
 """Of the episode's clock that one `noop` lets pass."""
 _EPISODE_MS = 1_000_000
+Place = tuple[float, float]
 _GREETING = "Hi! I am your UI assistant, I can perform web tasks for you. What can I help you with?"
 
 
@@ -40,33 +41,20 @@ class BrowserGymEnv(PageEnv):
         if dom_object:
             options["load"] = "each"
         self._dom = dom_object
-        usual = {
-            "reward": "positive",
-            "episode_ms": _EPISODE_MS,
-            "scripts": (script("browsergym.js"),),
-            "accessible": True,
-        }
-        super().__init__(page, **{**usual, **options})
-        width, height = self._size[:2]
-        self.observation_space = spaces.Dict(
-            _observed(width, height, screenshot=self._screenshot, dom_object=dom_object)
-        )
+        usual = {"reward": "positive", "episode_ms": _EPISODE_MS, "accessible": True}
+        super().__init__(page, **{**usual, "scripts": (script("browsergym.js"),), **options})
+        self.observation_space = spaces.Dict(self._spaces())
         self.action_space = spaces.Text(MAX_ACTION, min_length=0)
-        self._messages: list[dict[str, Any]] = []
-        self._goal = ""
-        self._over = False
-        self._held = 0
-        self._last = ("", "")
 
     _enter = "__evopolicy.gym.begin"
     _open = "__evopolicy.gym.first"
     _look = "__evopolicy.gym.look"
 
-    def _first(self, found: dict[str, Any]) -> Any:
-        self._goal = str(found["goal"])[:MAX_TEXT]
+    def _first(self, report: dict[str, Any]) -> Any:
+        self._goal = str(report["goal"])[:MAX_TEXT]
         self._messages = [_message("assistant", _GREETING, 0.0), _message("user", self._goal, 0.0)]
         self._over, self._held, self._last = False, 0, ("", "")
-        return self._observation(found)
+        return self._observation(report)
 
     def _step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         error = ""
@@ -77,9 +65,9 @@ class BrowserGymEnv(PageEnv):
         except ValueError as wrong:
             error = f"{type(wrong).__name__}: {wrong}"[:MAX_TEXT]
         self._last = action, error
-        outcome = self._pass()
-        reward, done, info = self._scored(outcome)
-        observed = self._observation(outcome)
+        report = self._pass()
+        reward, done, info = self._scored(report)
+        observed = self._observation(report)
         if self._over and not done:
             done, reward = True, 0.0
             info |= {"raw_reward": 0.0, "reason": "the agent reported the task infeasible", "success": False}
@@ -87,26 +75,26 @@ class BrowserGymEnv(PageEnv):
             info["last_action_error"] = error
         return observed, reward, done, False, info
 
-    def _observation(self, found: dict[str, Any]) -> dict[str, Any]:
+    def _observation(self, report: dict[str, Any]) -> dict[str, Any]:
         url = f"{ORIGIN}/{self._address.path}"
         observed: dict[str, Any] = {
             "chat_messages": tuple(dict(each) for each in self._messages),
             "goal": self._goal,
             "goal_object": ({"type": "text", "text": self._goal},),
             "open_pages_urls": (url,),
-            "open_pages_titles": (found.get("title", ""),),
+            "open_pages_titles": (report.get("title", ""),),
             "active_page_index": np.array((0,), dtype=np.int64),
             "url": url,
-            "axtree_object": _json(found.get("tree", {"nodes": []})),
-            "extra_element_properties": _json(found.get("properties", {})),
-            "focused_element_bid": found.get("focused", ""),
+            "axtree_object": _json(report.get("tree", {"nodes": []})),
+            "extra_element_properties": _json(report.get("properties", {})),
+            "focused_element_bid": report.get("focused", ""),
             "last_action": self._last[0],
             "last_action_error": self._last[1],
-            "elapsed_time": np.array((found["now"] / 1000,), dtype=np.float64),
+            "elapsed_time": np.array((report["now"] / 1000,), dtype=np.float64),
         }
         if self._dom:
             empty: dict[str, Any] = {"documents": [], "strings": []}
-            observed["dom_object"] = _json(empty if found["left"] else self.page.snapshot())
+            observed["dom_object"] = _json(empty if report["left"] else self.page.snapshot())
         if self._screenshot:
             observed["screenshot"] = self.picture(*self._size[:2])
         return observed
@@ -131,16 +119,12 @@ class BrowserGymEnv(PageEnv):
             if self._do("checked", bid)["checked"] != wanted:
                 raise ValueError("Clicking the checkbox did not change its state")
 
-    def _place(self, bid: str) -> tuple[float, float]:
+    def _place(self, bid: str) -> Place:
         place = self._do("place", bid)
         return place["x"], place["y"]
 
     def _mouse(
-        self,
-        at: tuple[float, float],
-        *events: tuple[str, int],
-        button: Any = "left",
-        modifiers: int | None = None,
+        self, at: Place, *events: tuple[str, int], button: Any = "left", modifiers: int | None = None
     ) -> None:
         """`modifiers`: by default the keys that are held."""
         if button not in ("left", "middle", "right"):
@@ -158,37 +142,33 @@ class BrowserGymEnv(PageEnv):
         self.page.press(*_key(name), self._held)
 
     def _do(self, what: str, *arguments: Any) -> dict[str, Any]:
-        found: dict[str, Any] = self.page.run(
-            f"__evopolicy.gym.{what}({', '.join(map(json.dumps, arguments))})"
-        )
-        if "error" in found:
-            raise ValueError(found["error"])
-        return found
+        """What a function of the page's script returns. Raises ValueError with the error that it reports."""
+        given = ", ".join(map(json.dumps, arguments))
+        outcome: dict[str, Any] = self.page.run(f"__evopolicy.gym.{what}({given})")
+        if "error" in outcome:
+            raise ValueError(outcome["error"])
+        return outcome
 
-
-def _observed(width: int, height: int, *, screenshot: bool, dom_object: bool) -> dict[str, Any]:
-    text, plain = spaces.Text(MAX_TEXT, min_length=0), spaces.Text(MAX_JSON, min_length=0)
-    seconds = spaces.Box(0.0, np.inf, (1,), np.float64)
-    observed: dict[str, Any] = {
-        "chat_messages": spaces.Sequence(spaces.Dict({"role": text, "timestamp": seconds, "message": text})),
-        "goal": text,
-        "goal_object": spaces.Sequence(spaces.Dict({"type": text, "text": text})),
-        "open_pages_urls": spaces.Sequence(text),
-        "open_pages_titles": spaces.Sequence(text),
-        "active_page_index": spaces.Box(0, 255, (1,), np.int64),
-        "url": text,
-        "axtree_object": plain,
-        "extra_element_properties": plain,
-        "focused_element_bid": text,
-        "last_action": text,
-        "last_action_error": text,
-        "elapsed_time": seconds,
-    }
-    if dom_object:
-        observed["dom_object"] = plain
-    if screenshot:
-        observed["screenshot"] = spaces.Box(0, 255, (height, width, 3), np.uint8)
-    return observed
+    def _spaces(self) -> dict[str, Any]:
+        """Of the parts of an observation."""
+        text, plain = spaces.Text(MAX_TEXT, min_length=0), spaces.Text(MAX_JSON, min_length=0)
+        seconds, urls = spaces.Box(0.0, np.inf, (1,), np.float64), spaces.Sequence(text)
+        message = {"role": text, "timestamp": seconds, "message": text}
+        parts: dict[str, Any] = {
+            **dict.fromkeys(("goal", "url", "focused_element_bid", "last_action", "last_action_error"), text),
+            **dict.fromkeys(("axtree_object", "extra_element_properties"), plain),
+            "chat_messages": spaces.Sequence(spaces.Dict(message)),
+            "goal_object": spaces.Sequence(spaces.Dict({"type": text, "text": text})),
+            **dict.fromkeys(("open_pages_urls", "open_pages_titles"), urls),
+            "active_page_index": spaces.Box(0, 255, (1,), np.int64),
+            "elapsed_time": seconds,
+        }
+        if self._dom:
+            parts["dom_object"] = plain
+        if self._screenshot:
+            width, height = self._size[:2]
+            parts["screenshot"] = spaces.Box(0, 255, (height, width, 3), np.uint8)
+        return parts
 
 
 def _json(value: Any) -> str:
@@ -199,24 +179,17 @@ def _message(role: str, text: str, at_s: float) -> dict[str, Any]:
     return {"role": role, "timestamp": np.array((at_s,), dtype=np.float64), "message": text}
 
 
-def _modifiers(names: list[Any]) -> int:
-    """The modifiers of a click."""
-    found = 0
+def _clicked(env: BrowserGymEnv, bid: str, button: Any, names: list[Any], *events: tuple[str, int]) -> None:
+    modifiers = 0
     for name in names:
         key = "Control" if name == "ControlOrMeta" else name
         if key not in keys.MODIFIERS:
             raise ValueError(f"modifiers has {name!r}: {', '.join(keys.MODIFIERS)}, ControlOrMeta")
-        found |= keys.MODIFIERS[key]
-    return found
+        modifiers |= keys.MODIFIERS[key]
+    env._mouse(env._place(bid), *events, button=button, modifiers=modifiers)
 
 
-def _clicked(env: BrowserGymEnv, bid: str, button: Any, names: list[Any], *events: tuple[str, int]) -> None:
-    env._mouse(env._place(bid), *events, button=button, modifiers=_modifiers(names))
-
-
-def _dragged(
-    env: BrowserGymEnv, start: Callable[[], tuple[float, float]], end: Callable[[], tuple[float, float]]
-) -> None:
+def _dragged(env: BrowserGymEnv, start: Callable[[], Place], end: Callable[[], Place]) -> None:
     env._mouse(start(), CLICK[0])
     env._mouse(end(), CLICK[1])
 
@@ -270,7 +243,7 @@ _ACTIONS: Mapping[str, Callable[..., object]] = {
 
 
 def _key(name: str) -> tuple[keys.Key, int]:
-    found = keys.combined(name)
-    if found is None:
+    key = keys.combined(name)
+    if key is None:
         raise ValueError(f'Unknown key: "{name[:40]}"')
-    return found
+    return key

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import base64
 import hashlib
+import itertools
 import json
 import math
 import mimetypes
@@ -85,12 +86,10 @@ class Page:
     def __init__(self) -> None:
         self.opened: Address | None = None
         self._browser: Chromium | None = None
-        self._context = ""
-        self._session = ""
+        self._context = self._session = self._script = ""
         self._loaded = False
         self._bodies: dict[Path, tuple[str, str]] = {}
         self._episodes = 0
-        self._script = ""
         self._identity: dict[str, str] | None = None
         self._buttons = 0
         self._held = "none"
@@ -148,10 +147,10 @@ class Page:
             self._context = str(made["browserContextId"])
             own = {"browserContextId": self._context}
             devtools.send("Browser.setDownloadBehavior", wanted=False, behavior="deny", **own)
-            target = devtools.call("Target.createTarget", timeout_s=CALL_S, url="about:blank", **own)[
-                "targetId"
-            ]
-            attached = devtools.call("Target.attachToTarget", timeout_s=CALL_S, targetId=target, flatten=True)
+            target = devtools.call("Target.createTarget", timeout_s=CALL_S, url="about:blank", **own)
+            attached = devtools.call(
+                "Target.attachToTarget", timeout_s=CALL_S, targetId=target["targetId"], flatten=True
+            )
             self._session = str(attached["sessionId"])
         except BrowserLostError as error:
             self.lose()
@@ -162,69 +161,33 @@ class Page:
         if self._identity is None:
             if not self._session:
                 self._begin_context()
-            widths = self.run(_MEASURE)
-            fonts = hashlib.sha256(json.dumps(widths).encode()).hexdigest()[:12]
+            fonts = hashlib.sha256(json.dumps(self.run(_MEASURE)).encode()).hexdigest()[:12]
             self._identity = {"chromium": self.browser.version.partition("/")[2], "fonts": fonts}
         return self._identity
 
     def run(self, script: str) -> Any:
         """Value of an expression in the page, promises awaited. BrowserLostError when it throws or does not end."""
-        number = self._send(
+        outcome = self.send(
             "Runtime.evaluate", expression=script, returnByValue=True, awaitPromise=True, userGesture=True
         )
-        found = self.browser.devtools.result(number, CALL_S)
-        if "exceptionDetails" in found:
-            details = found["exceptionDetails"]
+        if details := outcome.get("exceptionDetails"):
             text = details.get("exception", {}).get("description") or details.get("text", "")
             raise BrowserLostError(f"a script failed in the page: {str(text)[:500]}")
-        return found["result"].get("value")
+        return outcome["result"].get("value")
 
     def tell(self, script: str) -> Any:
         """As `run`, for large values: the page writes them as JSON, which is quicker than the browser's own way. Half
         of a surrogate pair, which no observation can have, becomes U+FFFD."""
-        found = self.run(f"(async () => __evopolicy.json(await ({script})))()")
+        text = self.run(f"(async () => __evopolicy.json(await ({script})))()")
         try:
             # Whole pairs are not escaped.
-            return msgspec.json.decode(_HALF_PAIR.sub(r"\1\\ufffd", found) if "\\ud" in found else found)
+            return msgspec.json.decode(_HALF_PAIR.sub(r"\1\\ufffd", text) if "\\ud" in text else text)
         except (TypeError, msgspec.MsgspecError) as error:
             raise BrowserLostError(f"the page sent invalid JSON: {error}") from error
 
     def send(self, method: str, **params: Any) -> dict[str, Any]:
         """One command of the DevTools protocol to the page, and its result."""
         return self.browser.devtools.result(self._send(method, **params), CALL_S)
-
-    def mouse(
-        self, *events: tuple[str, float, float, Button, int], modifiers: int = 0, resting: bool = False
-    ) -> None:
-        """Mouse events in order, each a type (`MOVE`, `PRESS`, `RELEASE`), a place in CSS pixels, a button and the
-        number of clicks. `modifiers`: the keys held meanwhile. A press on a scrollbar is left out, unless `resting`,
-        where there is none."""
-        # Whole pixels, as the page is told: from parts of one the browser selects other characters from time to time.
-        events = tuple((kind, math.floor(x), math.floor(y), button, n) for kind, x, y, button, n in events)
-        pressed = dict.fromkeys((x, y) for kind, x, y, _, _ in events if kind == PRESS and not resting)
-        # Asked before the first event: to wait for a mouse that moves is to wait for the next frame.
-        bars = [place for place in pressed if self.run("__evopolicy.bar({}, {})".format(*place))]
-        self._touched = True
-        numbers: list[int] = []
-        for kind, x, y, button, clicks in events:
-            self.mouse_at = x, y
-            event: dict[str, Any] = {"type": kind, "x": x, "y": y, "button": button, "clickCount": clicks}
-            if kind == MOVE:
-                event["button"] = self._held
-            elif kind == PRESS and (x, y) in bars:
-                continue
-            else:
-                bit = _BITS[button]
-                self._buttons = self._buttons | bit if kind == PRESS else self._buttons & ~bit
-                self._held = button if self._buttons else "none"
-            event["buttons"] = self._buttons
-            # The time tells the page's script that it is an action's.
-            numbers.append(self._send("Input.dispatchMouseEvent", **event, modifiers=modifiers, timestamp=1))
-            if kind == MOVE and self._held != "none":
-                self._await(numbers)
-                numbers.clear()
-                self.run("__evopolicy.moved()")
-        self._await(numbers)
 
     def point(
         self,
@@ -233,12 +196,41 @@ class Page:
         *events: tuple[str, int],
         button: Button = "left",
         modifiers: int = 0,
+        move: bool = True,
         resting: bool = False,
     ) -> None:
-        """Moves the mouse to a place, CSS pixels, and then presses and releases its button there: types of events, each
-        with the number of clicks. The rest is as for `mouse`."""
-        there = [(kind, x, y, button, clicks) for kind, clicks in ((MOVE, 0), *events)]
-        self.mouse(*there, modifiers=modifiers, resting=resting)
+        """Moves the mouse to a place, CSS pixels, and then presses and releases its button there: types of events
+        (`PRESS`, `RELEASE`), each with the number of clicks. `modifiers`: the keys held meanwhile. `move=False`: the
+        mouse is there. A press on a scrollbar is left out, unless `resting`, where there is none."""
+        # Whole pixels, as the page is told: from parts of one the browser selects other characters from time to time.
+        x, y = math.floor(x), math.floor(y)
+        pressed = not resting and any(kind == PRESS for kind, _ in events)
+        # Asked before the first event: to wait for a mouse that moves is to wait for the next frame.
+        on_bar = pressed and self.run(f"__evopolicy.bar({x}, {y})")
+        self._touched, self.mouse_at = True, (x, y)
+        numbers: list[int] = []
+        for kind, clicks in ([(MOVE, 0)] if move else []) + [*events]:
+            if kind == PRESS and on_bar:
+                continue
+            if kind != MOVE:
+                bit = _BITS[button]
+                self._buttons = self._buttons | bit if kind == PRESS else self._buttons & ~bit
+                self._held = button if self._buttons else "none"
+            event: dict[str, Any] = {
+                "type": kind,
+                "x": x,
+                "y": y,
+                "clickCount": clicks,
+                "modifiers": modifiers,
+            }
+            event |= {"button": self._held if kind == MOVE else button, "buttons": self._buttons}
+            # The time tells the page's script that it is an action's.
+            numbers.append(self._send("Input.dispatchMouseEvent", **event, timestamp=1))
+            if kind == MOVE and self._held != "none":
+                self._await(numbers)
+                numbers.clear()
+                self.run("__evopolicy.moved()")
+        self._await(numbers)
 
     def wheel(self, x: float, y: float, delta_x: float, delta_y: float) -> None:
         """Turns the mouse's wheel at a place, CSS pixels."""
@@ -256,14 +248,8 @@ class Page:
                 self._down[pressed.code] = pressed
             else:
                 self._down.pop(pressed.code, None)
-            event: dict[str, Any] = {
-                "key": key.key,
-                "code": key.code,
-                "windowsVirtualKeyCode": key.number,
-                "modifiers": modifiers,
-                "location": key.location,
-                "isKeypad": key.location == 3,
-            }
+            event: dict[str, Any] = {"key": key.key, "code": key.code, "windowsVirtualKeyCode": key.number}
+            event |= {"modifiers": modifiers, "location": key.location, "isKeypad": key.location == 3}
             if kind == "down" and key.text and not modifiers & 7:
                 event |= {"type": "keyDown", "text": key.text, "unmodifiedText": key.text}
             else:
@@ -305,26 +291,24 @@ class Page:
     def snapshot(self) -> dict[str, Any]:
         """The page's documents with their layout, as `DOMSnapshot.captureSnapshot` gives them, but for what differs
         each time (numbers of nodes and frames) and the texts of scripts and styles."""
-        found = self.send(
+        snapshot = self.send(
             "DOMSnapshot.captureSnapshot", computedStyles=[], includeDOMRects=True, includePaintOrder=True
         )
-        strings, counted = found["strings"], 0
-        for n, document in enumerate(found["documents"]):
+        strings, numbers = snapshot["strings"], itertools.count(1)
+        for n, document in enumerate(snapshot["documents"]):
             strings[document["frameId"]] = str(n)
             nodes = document["nodes"]
-            size = len(nodes["nodeType"])
-            nodes["backendNodeId"] = list(range(counted + 1, counted + size + 1))
-            counted += size
+            nodes["backendNodeId"] = list(itertools.islice(numbers, len(nodes["nodeType"])))
             for parent, value in zip(nodes["parentIndex"], nodes["nodeValue"], strict=True):
                 if value >= 0 and parent >= 0 and strings[nodes["nodeName"][parent]] in _CODE:
                     strings[value] = ""
-        return found
+        return snapshot
 
     def release(self) -> None:
         """Lets go of keys and of the mouse's buttons."""
         self.keys(*(("up", key, 0) for key in tuple(self._down.values())))
-        held = [button for button, bit in _BITS.items() if self._buttons & bit]
-        self.mouse(*((RELEASE, *self.mouse_at, button, 1) for button in held))
+        for button in [button for button, bit in _BITS.items() if self._buttons & bit]:
+            self.point(*self.mouse_at, (RELEASE, 1), button=button, move=False)
 
     def rest(self) -> None:
         """Clicks where there is neither a task nor a scrollbar: the page keeps nothing of earlier places of mouse and
@@ -366,14 +350,14 @@ class Page:
         browser = self._browser
         if browser is None:
             return
+        target = params.get("targetInfo", {})
         if method == "Fetch.requestPaused":
             self._serve(params, session)
-        elif (method == "Target.attachedToTarget" and params["targetInfo"]["type"] != "page") or (
-            method == "Target.targetCreated" and params["targetInfo"].get("openerId")
+        elif (method == "Target.attachedToTarget" and target["type"] != "page") or (
+            method == "Target.targetCreated" and target.get("openerId")
         ):
             # Another frame's process, a worker, or another window: a page has none of them.
-            target = params["targetInfo"]["targetId"]
-            browser.devtools.send("Target.closeTarget", wanted=False, targetId=target)
+            browser.devtools.send("Target.closeTarget", wanted=False, targetId=target["targetId"])
         elif session != self._session:
             return
         elif method == "Page.loadEventFired":
@@ -384,16 +368,15 @@ class Page:
             browser.devtools.send("Page.handleJavaScriptDialog", session, wanted=False, accept=False)
 
     def _serve(self, params: dict[str, Any], session: str) -> None:
-        answer: dict[str, Any] = {"requestId": params["requestId"]}
-        found = self._body(params["request"]["url"])
-        if found is None:
-            method, answer["errorReason"] = "Fetch.failRequest", _NO_REASON
+        body = self._body(params["request"]["url"])
+        if body is None:
+            method, answer = "Fetch.failRequest", {"errorReason": _NO_REASON}
         else:
-            headers = {"Content-Type": found[0], "Cache-Control": "max-age=31536000, immutable"}
+            headers = {"Content-Type": body[0], "Cache-Control": "max-age=31536000, immutable"}
             listed = [{"name": name, "value": value} for name, value in headers.items()]
             method = "Fetch.fulfillRequest"
-            answer |= {"responseCode": 200, "responseHeaders": listed, "body": found[1]}
-        self.browser.devtools.send(method, session, wanted=False, **answer)
+            answer = {"responseCode": 200, "responseHeaders": listed, "body": body[1]}
+        self.browser.devtools.send(method, session, wanted=False, requestId=params["requestId"], **answer)
 
     def _body(self, url: str) -> tuple[str, str] | None:
         """Media type and base64 of the file that an address names; None for every other address."""

@@ -31,7 +31,7 @@ _MAX_NAMED, _MAX_NAME = 16, 100
 _PAGES = "evopolicy_worker.environments.browser.registered"
 """Registers pages with options of one's own."""
 
-left_out: dict[str, dict[str, None]] = {}
+dropped: dict[str, dict[str, None]] = {}
 """By id, the keys of `info` whose texts were left out since it was last made for a description or a job, the first
 `_MAX_NAMED`."""
 
@@ -46,8 +46,8 @@ class ForeignFamily(GymnasiumFamily):
         self._id = entry.id
         name = entry.gymnasium_id or ""
         self._module = name.partition(":")[0] if ":" in name else ""
-        self._told = frozenset(entry.info_strings)
-        self._left_out = left_out[entry.id] = {}
+        self._strings = frozenset(entry.info_strings)
+        self._dropped = dropped[entry.id] = {}
 
     def installed(self) -> bool:
         return super().installed() and (not self._module or _package(self._module) is not None)
@@ -70,10 +70,12 @@ class ForeignFamily(GymnasiumFamily):
         plain = super().info(info)
         if self._module == _PAGES:  # its texts are ours
             return plain
-        for key in [key for key, value in plain.items() if isinstance(value, str) and key not in self._told]:
+        for key in [
+            key for key, value in plain.items() if isinstance(value, str) and key not in self._strings
+        ]:
             del plain[key]
-            if len(self._left_out) < _MAX_NAMED:
-                self._left_out[key[:_MAX_NAME]] = None
+            if len(self._dropped) < _MAX_NAMED:
+                self._dropped[key[:_MAX_NAME]] = None
         return plain
 
     def packages(self, entry: Entry) -> dict[str, str]:
@@ -104,17 +106,12 @@ def _package(module: str) -> Path | None:
 def _own(top: str, data: tuple[str, ...] = ()) -> dict[str, str]:
     """The package's version, where it is a distribution's, and a digest of its files and its data: code that is edited
     in place has no other version."""
-    place = _package(top)
-    named = packages_distributions().get(top, [])
-    digest = hashlib.sha256()
-    for each in (*([] if place is None else [place]), *map(Path, data)):
-        suffixes = _SOURCES if each == place else ("",)
-        files = (
-            sorted(path for path in each.rglob("*") if path.is_file() and path.name.endswith(suffixes))
-            if each.is_dir()
-            else [each]
-        )
+    place, digest = _package(top), hashlib.sha256()
+    for each in (*filter(None, (place,)), *map(Path, data)):
+        files = sorted(path for path in each.rglob("*") if path.is_file()) if each.is_dir() else [each]
+        if each == place and each.is_dir():
+            files = [path for path in files if path.name.endswith(_SOURCES)]
         for path in files[:_MAX_FILES]:
             digest.update(path.name.encode() + b"\0" + path.read_bytes() + b"\0")
-    release = version(named[0]) if named else "0"
-    return {(named[0] if named else top).lower(): f"{release}+src.{digest.hexdigest()[:12]}"}
+    name = packages_distributions().get(top, [""])[0]
+    return {(name or top).lower(): f"{version(name) if name else '0'}+src.{digest.hexdigest()[:12]}"}

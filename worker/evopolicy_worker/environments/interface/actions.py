@@ -17,31 +17,31 @@ Works from the schema of the action space alone, compiled once: `repair` runs on
 
 from __future__ import annotations
 
-import string
-from collections.abc import Mapping
-from typing import Any, Protocol
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from evopolicy_common.messages.environment import SpaceSchema
-from evopolicy_worker.environments.interface.spaces import bounds
+from evopolicy_worker.environments.interface.spaces import USUAL_CHARACTERS, bounds
 
 _FAST_ELEMENTS = 32
 """Up to this many elements a loop over Python floats is faster than numpy's comparisons."""
 _MAX_UNWRAP = 8
 MAX_ITEMS = 256
 """Of an action that is a Sequence or a Graph; what is beyond is cut off."""
-_CHARACTERS = string.ascii_letters + string.digits
-"""Gymnasium's default character set, of which random Text is made."""
 
 
-class ActionCodec(Protocol):
+class ActionCodec(ABC):
     """An action space, compiled."""
 
+    @abstractmethod
     def repair(self, raw: object) -> tuple[Any, bool]:
         """A valid action for what the policy returned, and whether that changed its meaning. Never raises."""
 
+    @abstractmethod
     def sample(self, rng: np.random.Generator) -> Any:
         """A random action, distributed as Gymnasium's `space.sample()`, and of the same bits for the leaf spaces.
 
@@ -50,65 +50,40 @@ class ActionCodec(Protocol):
 
     def neutral(self) -> Any:
         """The replacement for an action that cannot be read."""
+        return self.repair(None)[0]
 
 
 def compile_actions(schema: SpaceSchema) -> ActionCodec:
     """The codec of an action space. TypeError for an unknown kind of space."""
-    kind = schema["type"]
-    if kind == "Discrete":
-        return _Discrete(schema["n"], schema.get("start", 0))
-    if kind in ("Box", "Image"):
-        return _Box(schema)
-    if kind == "MultiDiscrete":
-        return _MultiDiscrete(schema["nvec"], schema.get("start", 0), schema.get("dtype", "int64"))
-    if kind == "MultiBinary":
-        return _MultiBinary(schema["n"])
-    if kind == "Text":
-        return _Text(schema["min_length"], schema["max_length"], schema.get("characters"))
-    if kind == "Dict":
-        return _Dict({key: compile_actions(part) for key, part in schema["spaces"].items()})
-    if kind == "Tuple":
-        return _Tuple(dict(enumerate(map(compile_actions, schema["spaces"]))))
-    if kind == "Sequence":
-        return _Sequence(compile_actions(schema["space"]), stacked=schema["stacked"])
-    if kind == "OneOf":
-        return _OneOf([compile_actions(part) for part in schema["spaces"]])
-    if kind == "Graph":
-        edges = None if schema["edge_space"] is None else compile_actions(schema["edge_space"])
-        return _Graph(compile_actions(schema["node_space"]), edges)
-    raise TypeError(f"no actions for a space of type {kind!r}")
+    codec = _CODECS.get(schema["type"])
+    if codec is None:
+        raise TypeError(f"no actions for a space of type {schema['type']!r}")
+    return codec(schema)
 
 
-class _Discrete:
-    def __init__(self, n: int, start: int) -> None:
-        self._n = n
-        self._low = start
-        self._high = start + n - 1
+class _Discrete(ActionCodec):
+    def __init__(self, schema: SpaceSchema) -> None:
+        self._n, self._low = schema["n"], schema.get("start", 0)
+        self._high = self._low + self._n - 1
 
     def repair(self, raw: object) -> tuple[int, bool]:
         value = raw if type(raw) is int else _integer(raw)
         if value is None:
             return self._low, True
-        if self._low <= value <= self._high:
-            return value, False
-        return (self._low if value < self._low else self._high), True
+        kept = min(max(value, self._low), self._high)
+        return kept, kept != value
 
     def sample(self, rng: np.random.Generator) -> int:
         return self._low + int(rng.integers(self._n))
 
-    def neutral(self) -> int:
-        return self._low
 
-
-class _Box:
+class _Box(ActionCodec):
     def __init__(self, schema: SpaceSchema) -> None:
         self._dtype = np.dtype(schema["dtype"])
         self._shape = tuple(schema["shape"])
         self._low, self._high = bounds(schema)
-        self._bounded_below = np.isfinite(self._low)
-        self._bounded_above = np.isfinite(self._high)
-        self._bounded = bool(self._bounded_below.all() and self._bounded_above.all())
         self._is_float = self._dtype.kind == "f"
+        self._uniform = self._is_float and bool(np.isfinite((self._low, self._high)).all())
         whole = np.uint8 if self._dtype.kind == "b" else self._dtype
         limits: Any = np.finfo(self._dtype) if self._is_float else np.iinfo(whole)
         # An infinite element becomes the largest finite one: simulators do not survive infinities.
@@ -125,14 +100,10 @@ class _Box:
     def repair(self, raw: object) -> tuple[NDArray[Any], bool]:
         if self._fast:
             # Nearly every action of nearly every policy: right shape, within bounds.
-            if type(raw) is np.ndarray and raw.dtype.kind == "f" and raw.shape == self._shape:
-                for value, (low, high) in zip(raw.tolist(), self._limits, strict=True):
-                    if not low <= value <= high:
-                        break
-                else:
-                    return raw.astype(self._dtype), False
-            elif type(raw) is list and len(raw) == len(self._limits):
-                for value, (low, high) in zip(raw, self._limits, strict=True):
+            right = type(raw) is np.ndarray and raw.dtype.kind == "f" and raw.shape == self._shape
+            listed = raw.tolist() if right else raw  # type: ignore[attr-defined]
+            if type(listed) is list and len(listed) == len(self._limits):
+                for value, (low, high) in zip(listed, self._limits, strict=True):
                     if type(value) is not float or not low <= value <= high:
                         break
                 else:
@@ -143,7 +114,7 @@ class _Box:
     def _repair_any(self, raw: object) -> tuple[NDArray[Any], bool]:
         shaped, invalid = _shaped(_numbers(raw), self._shape)
         if shaped is None:
-            return self.neutral(), True
+            return self._cast(self._neutral), True
         values = shaped.astype(np.float64)
         lost = np.isnan(values)
         if lost.any():
@@ -158,10 +129,10 @@ class _Box:
         return self._cast(np.minimum(np.maximum(values, self._clip_low), self._clip_high)), invalid
 
     def sample(self, rng: np.random.Generator) -> NDArray[Any]:
-        low, below, above = self._low, self._bounded_below, self._bounded_above
-        high = self._high if self._is_float else self._high + 1
-        if self._is_float and self._bounded:
+        low, high = self._low, self._high if self._is_float else self._high + 1
+        if self._uniform:
             return self._cast(rng.uniform(low, high))
+        below, above = np.isfinite(low), np.isfinite(high)
         values = np.empty(self._shape)
         # Gymnasium's order of drawing, so that the same generator gives the same action.
         free, only_high, only_low, both = ~below & ~above, ~below & above, below & ~above, below & above
@@ -173,25 +144,22 @@ class _Box:
             values = np.minimum(np.maximum(np.floor(values), self._clip_low), self._clip_high)
         return self._cast(values)
 
-    def neutral(self) -> NDArray[Any]:
-        return self._cast(self._neutral)
-
     def _cast(self, values: Any) -> NDArray[Any]:
         """A fresh array of the space's dtype; numpy makes scalars of arrays without axes."""
         return np.asarray(values).astype(self._dtype)
 
 
-class _MultiDiscrete:
-    def __init__(self, nvec: Any, start: Any, dtype: str) -> None:
-        self._dtype = np.dtype(dtype)
-        self._n = np.array(nvec, dtype=np.int64)
-        self._low = np.broadcast_to(np.array(start, dtype=np.int64), self._n.shape)
+class _MultiDiscrete(ActionCodec):
+    def __init__(self, schema: SpaceSchema) -> None:
+        self._dtype = np.dtype(schema.get("dtype", "int64"))
+        self._n = np.array(schema["nvec"], dtype=np.int64)
+        self._low = np.broadcast_to(np.array(schema.get("start", 0), dtype=np.int64), self._n.shape)
         self._high = self._low + self._n - 1
 
     def repair(self, raw: object) -> tuple[NDArray[Any], bool]:
         shaped, invalid = _shaped(_numbers(raw), self._n.shape)
         if shaped is None:
-            return self.neutral(), True
+            return self._low.astype(self._dtype), True
         if shaped.dtype.kind == "f":
             with np.errstate(all="ignore"):
                 whole = shaped == np.trunc(shaped)  # False for NaN, True for infinities, which are clipped
@@ -204,92 +172,81 @@ class _MultiDiscrete:
         drawn = (rng.random(self._n.shape) * self._n).astype(np.int64) + self._low
         return drawn.astype(self._dtype, copy=False)
 
-    def neutral(self) -> NDArray[Any]:
-        return self._low.astype(self._dtype)
-
 
 class _MultiBinary(_MultiDiscrete):
-    def __init__(self, n: int | list[int]) -> None:
-        super().__init__(np.full(n, 2), 0, "int8")
+    def __init__(self, schema: SpaceSchema) -> None:
+        super().__init__({"nvec": np.full(schema["n"], 2), "dtype": "int8"})
 
     def sample(self, rng: np.random.Generator) -> NDArray[np.int8]:
         return rng.integers(low=0, high=2, size=self._n.shape, dtype=np.int8)
 
 
-class _Text:
-    def __init__(self, min_length: int, max_length: int, characters: str | None) -> None:
-        """`characters`: those that it is made of; None: any, and random ones are of Gymnasium's usual set."""
-        self._min = min_length
-        self._max = max_length
-        self._allowed = None if characters is None else frozenset(characters)
-        self._characters = characters or _CHARACTERS
-        self._filler = self._characters[0]
+class _Text(ActionCodec):
+    """Made of the schema's `characters`; without them of any, and random ones are of Gymnasium's usual set."""
+
+    def __init__(self, schema: SpaceSchema) -> None:
+        self._min, self._max = schema["min_length"], schema["max_length"]
+        self._allowed = frozenset(schema["characters"]) if "characters" in schema else None
+        self._characters = schema.get("characters") or USUAL_CHARACTERS
 
     def repair(self, raw: object) -> tuple[str, bool]:
-        if not isinstance(raw, str):
-            return self.neutral(), True
-        kept = raw if self._allowed is None else "".join(each for each in raw if each in self._allowed)
-        invalid = len(kept) != len(raw) or not self._min <= len(kept) <= self._max
-        return kept[: self._max].ljust(self._min, self._filler), invalid
+        text = raw if isinstance(raw, str) else ""
+        kept = text if self._allowed is None else "".join(each for each in text if each in self._allowed)
+        invalid = text is not raw or len(kept) != len(text) or not self._min <= len(kept) <= self._max
+        return kept[: self._max].ljust(self._min, self._characters[0]), invalid
 
     def sample(self, rng: np.random.Generator) -> str:
         length = int(rng.integers(self._min, self._max + 1))
         return "".join(self._characters[k] for k in rng.integers(len(self._characters), size=length).tolist())
 
-    def neutral(self) -> str:
-        return self._filler * self._min
 
-
-class _Dict:
-    def __init__(self, parts: Mapping[Any, ActionCodec]) -> None:
-        self._parts = parts
+class _Dict(ActionCodec):
+    def __init__(self, schema: SpaceSchema) -> None:
+        self._parts = {key: compile_actions(part) for key, part in schema["spaces"].items()}
 
     def repair(self, raw: object) -> tuple[Any, bool]:
-        if not isinstance(raw, dict):
-            return self.neutral(), True
-        invalid = raw.keys() != self._parts.keys()
+        given: dict[Any, Any] = raw if isinstance(raw, dict) else {}
+        invalid = given is not raw or given.keys() != self._parts.keys()
         action = {}
         for key, part in self._parts.items():
-            action[key], changed = part.repair(raw.get(key))
+            action[key], changed = part.repair(given.get(key))
             invalid = invalid or changed
-        return self._made(action), invalid
+        return action, invalid
 
     def sample(self, rng: np.random.Generator) -> Any:
-        return self._made({key: part.sample(rng) for key, part in self._parts.items()})
-
-    def neutral(self) -> Any:
-        return self._made({key: part.neutral() for key, part in self._parts.items()})
-
-    def _made(self, action: dict[Any, Any]) -> Any:
-        return action
+        return {key: part.sample(rng) for key, part in self._parts.items()}
 
 
 class _Tuple(_Dict):
     """Its parts by position."""
 
+    def __init__(self, schema: SpaceSchema) -> None:
+        super().__init__({"spaces": dict(enumerate(schema["spaces"]))})
+
     def repair(self, raw: object) -> tuple[Any, bool]:
-        if isinstance(raw, list | tuple) or (isinstance(raw, np.ndarray) and raw.ndim):
-            return super().repair(dict(enumerate(raw[: len(self._parts) + 1])))
-        return self.neutral(), True
+        listed = _listed(raw)
+        action, invalid = super().repair(
+            None if listed is None else dict(enumerate(listed[: len(self._parts) + 1]))
+        )
+        return tuple(action.values()), invalid
 
-    def _made(self, action: dict[Any, Any]) -> Any:
-        return tuple(action.values())
+    def sample(self, rng: np.random.Generator) -> Any:
+        return tuple(super().sample(rng).values())
 
 
-class _Sequence:
+class _Sequence(ActionCodec):
     """Items of one space, at most `MAX_ITEMS`; as an array where the space stacks them."""
 
-    def __init__(self, item: ActionCodec, *, stacked: bool) -> None:
-        self._item = item
-        self._stacked = stacked
+    def __init__(self, schema: SpaceSchema) -> None:
+        self.item = compile_actions(schema["space"])
+        self._stacked = schema["stacked"]
 
     def repair(self, raw: object) -> tuple[Any, bool]:
-        if not (isinstance(raw, list | tuple) or (isinstance(raw, np.ndarray) and raw.ndim)):
-            return self.neutral(), True
-        invalid = len(raw) > MAX_ITEMS
+        listed = _listed(raw)
+        invalid = listed is None or len(listed) > MAX_ITEMS
         items = []
-        for value in raw[:MAX_ITEMS]:
-            repaired, changed = self._item.repair(value)
+        for value in () if listed is None else listed[:MAX_ITEMS]:
+            repaired, changed = self.item.repair(value)
             items.append(repaired)
             invalid = invalid or changed
         return self._made(items), invalid
@@ -300,28 +257,25 @@ class _Sequence:
 
     def drawn(self, rng: np.random.Generator, n: int) -> Any:
         """`n` random items."""
-        return self._made([self._item.sample(rng) for _ in range(n)])
-
-    def neutral(self) -> Any:
-        return self._made([])
+        return self._made([self.item.sample(rng) for _ in range(n)])
 
     def _made(self, items: list[Any]) -> Any:
         if not self._stacked:
             return tuple(items)
-        one = np.asarray(self._item.neutral())
+        one = np.asarray(self.item.neutral())
         return np.array(items, dtype=one.dtype).reshape(-1, *one.shape)
 
 
-class _OneOf:
+class _OneOf(ActionCodec):
     """A pair: which of the spaces, and a value of it."""
 
-    def __init__(self, choices: list[ActionCodec]) -> None:
-        self._choices = choices
+    def __init__(self, schema: SpaceSchema) -> None:
+        self._choices = list(map(compile_actions, schema["spaces"]))
 
     def repair(self, raw: object) -> tuple[tuple[int, Any], bool]:
         index = _integer(raw[0]) if isinstance(raw, list | tuple) and len(raw) == 2 else None
         if index is None or not 0 <= index < len(self._choices):
-            return self.neutral(), True
+            return (0, self._choices[0].neutral()), True
         assert isinstance(raw, list | tuple)
         value, changed = self._choices[index].repair(raw[1])
         return (index, value), changed
@@ -330,53 +284,66 @@ class _OneOf:
         index = int(rng.integers(len(self._choices)))
         return index, self._choices[index].sample(rng)
 
-    def neutral(self) -> tuple[int, Any]:
-        return 0, self._choices[0].neutral()
 
-
-class _Graph:
+class _Graph(ActionCodec):
     """Nodes, and edges between them where the space has any: Gymnasium's `GraphInstance` from a dict of its three
     fields."""
 
-    def __init__(self, node: ActionCodec, edge: ActionCodec | None) -> None:
-        self._nodes = _Sequence(node, stacked=True)
-        self._edges = None if edge is None else _Sequence(edge, stacked=True)
+    def __init__(self, schema: SpaceSchema) -> None:
+        self._nodes = _Sequence({"space": schema["node_space"], "stacked": True})
+        edge = schema["edge_space"]
+        self._edges = None if edge is None else _Sequence({"space": edge, "stacked": True})
 
     def repair(self, raw: object) -> tuple[Any, bool]:
         if isinstance(raw, list | tuple) and len(raw) == 3:  # as a recording has it
             raw = dict(zip(("nodes", "edges", "edge_links"), raw, strict=True))
-        if not isinstance(raw, dict):
-            return self.neutral(), True
-        nodes, invalid = self._nodes.repair(raw.get("nodes"))
+        given: dict[str, Any] = raw if isinstance(raw, dict) else {}
+        nodes, invalid = self._nodes.repair(given.get("nodes"))
         if not len(nodes):
-            return self.neutral(), True
-        links = _numbers(raw["edge_links"]) if raw.get("edge_links") is not None else None
-        if self._edges is None or raw.get("edges") is None or links is None:
-            stray = raw.get("edges") is not None or raw.get("edge_links") is not None
-            return self._made(nodes, None, None), invalid or stray
-        edges, changed = self._edges.repair(raw["edges"])
-        fits = links.shape == (len(edges), 2) and links.dtype.kind in "iu"
-        if not fits or not ((links >= 0) & (links < len(nodes))).all():
-            return self._made(nodes, None, None), True
-        return self._made(nodes, edges, links.astype(np.int32)), invalid or changed
+            return self._made(self._nodes.repair([self._nodes.item.neutral()])[0]), True
+        edges, links = given.get("edges"), given.get("edge_links")
+        numbers = None if links is None else _numbers(links)
+        if self._edges is None or edges is None or numbers is None:
+            return self._made(nodes), invalid or edges is not None or links is not None
+        edges, changed = self._edges.repair(edges)
+        fits = numbers.shape == (len(edges), 2) and numbers.dtype.kind in "iu"
+        if not fits or not ((numbers >= 0) & (numbers < len(nodes))).all():
+            return self._made(nodes), True
+        return self._made(nodes, edges, numbers.astype(np.int32)), invalid or changed
 
     def sample(self, rng: np.random.Generator) -> Any:
         nodes = self._nodes.drawn(rng, 1 + int(rng.integers(10)))
         n = int(rng.integers(len(nodes) + 1)) if self._edges is not None else 0
         if self._edges is None or not n:
-            return self._made(nodes, None, None)
+            return self._made(nodes)
         edges = self._edges.drawn(rng, n)
         return self._made(nodes, edges, rng.integers(len(nodes), size=(n, 2)).astype(np.int32))
 
-    def neutral(self) -> Any:
-        nodes, _ = self._nodes.repair([self._nodes._item.neutral()])
-        return self._made(nodes, None, None)
-
     @staticmethod
-    def _made(nodes: Any, edges: Any, links: Any) -> Any:
+    def _made(nodes: Any, edges: Any = None, links: Any = None) -> Any:
         from gymnasium.spaces import GraphInstance
 
         return GraphInstance(nodes, edges, links)
+
+
+_CODECS: Mapping[str, Callable[[SpaceSchema], ActionCodec]] = {
+    "Discrete": _Discrete,
+    "Box": _Box,
+    "Image": _Box,
+    "MultiDiscrete": _MultiDiscrete,
+    "MultiBinary": _MultiBinary,
+    "Text": _Text,
+    "Dict": _Dict,
+    "Tuple": _Tuple,
+    "Sequence": _Sequence,
+    "OneOf": _OneOf,
+    "Graph": _Graph,
+}
+
+
+def _listed(raw: object) -> Any:
+    """`raw` if it is a list, a tuple, or an array with axes; otherwise None."""
+    return raw if isinstance(raw, list | tuple) or (isinstance(raw, np.ndarray) and raw.ndim) else None
 
 
 def _integer(raw: object) -> int | None:

@@ -20,24 +20,10 @@ REVISION = 1
 """Incremented when a change in the shared modules changes episodes. Scores of different revisions are not compared."""
 _ROOT = Path(__file__).parents[2]
 """The package `evopolicy_worker`."""
+_INTERFACE = "actions base gymnasium_adapter info observations rewards settings spaces wrappers"
 _SHARED = (
-    *(
-        f"environments/interface/{name}.py"
-        for name in (
-            "actions",
-            "base",
-            "gymnasium_adapter",
-            "info",
-            "observations",
-            "rewards",
-            "settings",
-            "spaces",
-            "wrappers",
-        )
-    ),
-    "episodes/*.py",
-    "slot_protocol/begun.py",
-    "sandbox/inside/*.py",
+    *(f"environments/interface/{name}.py" for name in _INTERFACE.split()),
+    *("episodes/*.py", "slot_protocol/begun.py", "sandbox/inside/*.py"),
 )
 """Modules that every episode uses."""
 
@@ -47,7 +33,8 @@ def adapter(family: type, revision: int, gymnasium_id: str) -> str:
 
     `revision`: the family's. `gymnasium_id`: selects the accelerations that the digest includes.
     """
-    own = {str(Path(inspect.getfile(each)).resolve()) for each in family.__mro__ if _is_ours(each)}
+    ours = (each for each in family.__mro__ if each.__module__.startswith("evopolicy_worker."))
+    own = {str(Path(inspect.getfile(each)).resolve()) for each in ours}
     served = [each.name.partition("_")[0] for each in ACCELERATIONS if each.serves(gymnasium_id)]
     helpers = [f"environments/accelerations/{name}_*.py" for name in dict.fromkeys(served)]
     helpers += ["environments/accelerations/specialise.py"] if served else []
@@ -77,10 +64,6 @@ def _version(name: str) -> str:
         return metadata.version(name)
     except metadata.PackageNotFoundError:
         return ""
-
-
-def _is_ours(family: type) -> bool:
-    return family.__module__.startswith(f"{__name__.partition('.')[0]}.")
 
 
 def _matching(pattern: str) -> list[Path]:

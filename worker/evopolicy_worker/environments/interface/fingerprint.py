@@ -13,15 +13,8 @@ from evopolicy_common.messages.worker import Fingerprint
 from evopolicy_worker.environments.interface.adapters import versions
 
 PACKAGES = (
-    "numpy",
-    "gymnasium",
-    "gymnasium-robotics",
-    "mujoco",
-    "Box2D",
-    "minigrid",
-    "highway-env",
-    "pygame-ce",
-    "pandas",
+    *("numpy", "gymnasium", "gymnasium-robotics", "mujoco", "Box2D"),
+    *("minigrid", "highway-env", "pygame-ce", "pandas"),
 )
 """Distributions that Core16's environments are made of. An environment's description names those that decide its
 results."""
@@ -48,6 +41,6 @@ def _source_digest() -> str:
 
 def _simd_features() -> str:
     """The instruction sets that numpy dispatches on here. Numerical libraries select their code by them."""
-    found = np.show_config(mode="dicts")
-    simd = found.get("SIMD Extensions", {}) if isinstance(found, dict) else {}
+    config = np.show_config(mode="dicts")
+    simd = config.get("SIMD Extensions", {}) if isinstance(config, dict) else {}
     return "+".join([*simd.get("baseline", []), *simd.get("found", [])])

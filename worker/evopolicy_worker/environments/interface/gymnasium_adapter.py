@@ -173,10 +173,8 @@ class GymnasiumEnvironment(Environment):
     def __init__(
         self, entry: Entry, family: GymnasiumFamily, *, render: bool = False, accelerations: bool = False
     ) -> None:
-        self._entry = entry
-        self._family = family
-        self._render = render
-        self._accelerate = accelerations
+        self._entry, self._family = entry, family
+        self._render, self._accelerate = render, accelerations
         self.accelerations: tuple[str, ...] = ()
         """Names of those in use."""
         self._factors: dict[str, float] = {}
@@ -187,34 +185,33 @@ class GymnasiumEnvironment(Environment):
         self.bare: gymnasium.Env[Any, Any]
         """The environment of the current episode, without the adapter."""
         self.rebuilds = family.rebuilds(entry)
-        self._used = False
-        self._options_used = False
+        self._used = self._options_used = False
         self._steps = 0
         self._build()
         self.parameters = tuple(sorted(family.parameters(self.bare)))
-        obs_schema = self._schema("observation_space")
-        action_schema = self._schema("action_space")
+        obs_schema, action_schema = self._schema("observation_space"), self._schema("action_space")
         self._observe = compile_observation(obs_schema)
         self._encode = converter(self.bare.observation_space, family.encoding, back=False)
         self._decode = converter(self.bare.action_space, family.encoding, back=True)
         self._promises: trial.Promises | None = None
         if not is_shipped(entry.id):
             self._promises = trial.Promises(obs_schema, action_schema, self._schema, entry.success)
-        self._plain = family.info
         self.action_codec = compile_actions(action_schema)
         components = entry.reward_components or family.components.get(entry.gymnasium_id or "", {})
         self._rewards = rewards.Scalarisation.of(entry, self.bare)
         if self._rewards is not None:
             components = self._rewards.texts(components)
-        spec, own_words = self.bare.spec, family.words(entry, self.bare)
-        about = About(entry, self.bare, obs_schema, action_schema, components, self._limit, own_words)
+        words, spec = family.words(entry, self.bare), self.bare.spec
+        about = About(entry, self.bare, obs_schema, action_schema, components, self._limit, words)
+        made = {"gymnasium_id": entry.gymnasium_id, "kwargs": entry.kwargs}
+        made["wrappers"] = [{"wrapper": each.wrapper, "kwargs": each.kwargs} for each in entry.wrappers]
         self.solved_by = family.solved_by.get(entry.gymnasium_id or "", "")
         self.description = EnvironmentDescription(
             env=entry.id,
             env_version=family.version(entry),
             title=entry.title,
             family=entry.family,
-            definition=_definition(entry),
+            definition={name: value for name, value in made.items() if value},
             reward_weights={} if self._rewards is None else self._rewards.weights,
             success=entry.success,
             success_at=entry.success_at,
@@ -248,8 +245,7 @@ class GymnasiumEnvironment(Environment):
             self._build()
         self._family.begin()
         self._used = True
-        self._options_used = case.options is not None
-        self._steps = 0
+        self._options_used, self._steps = case.options is not None, 0
         call.begin(env_id, "reset")
         returned = self.bare.reset(seed=case.seed, options=case.options)
         if self._promises is not None:
@@ -277,7 +273,7 @@ class GymnasiumEnvironment(Environment):
             obs, reward, terminated, truncated, info = returned
             if self._encode is not None:
                 obs = self._encode(obs)
-            plain = self._plain(info)
+            plain = self._family.info(info)
             plain["steps"] = self._steps
             if self._rewards is not None:
                 reward = self._rewards.scalar(reward, plain)
@@ -357,13 +353,6 @@ class GymnasiumEnvironment(Environment):
         if self._promises is not None:
             self._promises.strict = True
         trial.play(self)
-
-
-def _definition(entry: Entry) -> dict[str, Any]:
-    """How Gymnasium makes it, for the digest of its definition."""
-    wrappers = [{"wrapper": each.wrapper, "kwargs": each.kwargs} for each in entry.wrappers]
-    definition = {"gymnasium_id": entry.gymnasium_id, "kwargs": entry.kwargs, "wrappers": wrappers}
-    return {name: value for name, value in definition.items() if value}
 
 
 @contextlib.contextmanager

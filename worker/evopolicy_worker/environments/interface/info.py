@@ -19,19 +19,9 @@ MAX_CHARACTERS = 256
 """Longer strings are dropped."""
 
 
-def _same(value: Any) -> Any:
-    return value
-
-
-def _small_int(value: Any) -> int | None:
-    plain = int(value)
-    return plain if -(2**63) <= plain < 2**63 else None
-
-
 _SCALARS: dict[type, Callable[[Any], Any]] = {
-    float: _same,
-    bool: _same,
-    int: _small_int,
+    **dict.fromkeys((float, bool), lambda value: value),
+    int: lambda value: value if -(2**63) <= value < 2**63 else None,
     np.bool_: bool,
     **dict.fromkeys((np.float16, np.float32, np.float64), float),
     **dict.fromkeys((np.int8, np.int16, np.int32, np.int64, np.uint8, np.uint16, np.uint32), int),
@@ -42,8 +32,8 @@ def plain_info(info: Mapping[Any, Any]) -> dict[str, Any]:
     """The part of `info` that may be kept, as plain values, in the simulator's order."""
     plain: dict[str, Any] = {}
     for key, value in info.items():
-        convert = _SCALARS.get(type(value))
-        kept = convert(value) if convert is not None else _compound(value)
+        convert = _SCALARS.get(type(value), _compound)
+        kept = convert(value)
         if kept is not None and _may_name(key):
             plain[key] = kept
     return plain
@@ -65,8 +55,7 @@ def _compound(value: Any) -> Any:
 
 
 def _scalar(value: Any) -> Any:
-    convert = _SCALARS.get(type(value))
-    return convert(value) if convert is not None else None
+    return _SCALARS.get(type(value), lambda _: None)(value)
 
 
 @lru_cache(maxsize=4096)

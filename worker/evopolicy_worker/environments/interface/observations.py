@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from evopolicy_common.messages.environment import SpaceSchema
-from evopolicy_worker.environments.interface.spaces import array_of
+from evopolicy_worker.environments.interface.spaces import array_of, parts
 
 Converter = Callable[[Any], Any]
 
@@ -23,59 +23,27 @@ def compile_observation(schema: SpaceSchema) -> Converter:
     """A function from the simulator's observation to the plain one of this space. TypeError for an unknown space."""
     kind = schema["type"]
     if kind in ("Box", "Image", "MultiDiscrete", "MultiBinary"):
-        return _array(array_of(schema)[1])
-    if kind == "Discrete":
-        return int
-    if kind == "Text":
-        return str
-    if kind == "Dict":
-        return _dict({key: compile_observation(part) for key, part in schema["spaces"].items()})
-    if kind == "Tuple":
-        return _tuple([compile_observation(part) for part in schema["spaces"]])
+        array, dtype = np.array, array_of(schema)[1]
+        # A transposed image keeps its layout by default, and would be sent with swapped axes.
+        return lambda raw: array(raw, dtype=dtype, order="C")
+    if kind in ("Discrete", "Text"):
+        return int if kind == "Discrete" else str
     if kind == "Sequence":
-        return _sequence(schema)
+        if schema["stacked"]:
+            return _rows(schema["space"])
+        item = compile_observation(schema["space"])
+        return lambda raw: tuple(map(item, raw))
     if kind == "Graph":
         return _graph(schema)
+    inner = list(map(compile_observation, parts(schema)))
+    if kind == "Dict":
+        items = tuple(zip(schema["spaces"], inner, strict=True))
+        return lambda raw: {key: part(raw[key]) for key, part in items}
+    if kind == "Tuple":
+        return lambda raw: tuple(part(value) for part, value in zip(inner, raw, strict=True))
     if kind == "OneOf":
-        return _one_of([compile_observation(part) for part in schema["spaces"]])
+        return lambda raw: (int(raw[0]), inner[int(raw[0])](raw[1]))
     raise TypeError(f"no observations for a space of type {kind!r}")
-
-
-def _array(dtype: np.dtype[Any]) -> Converter:
-    array = np.array
-
-    def convert(raw: Any) -> Any:
-        # A transposed image keeps its layout by default, and would be sent with swapped axes.
-        return array(raw, dtype=dtype, order="C")
-
-    return convert
-
-
-def _dict(converters: dict[str, Converter]) -> Converter:
-    items = tuple(converters.items())
-
-    def convert(raw: Any) -> Any:
-        return {key: part(raw[key]) for key, part in items}
-
-    return convert
-
-
-def _tuple(converters: list[Converter]) -> Converter:
-    def convert(raw: Any) -> Any:
-        return tuple(part(value) for part, value in zip(converters, raw, strict=True))
-
-    return convert
-
-
-def _sequence(schema: SpaceSchema) -> Converter:
-    if schema["stacked"]:
-        return _rows(schema["space"])
-    convert = compile_observation(schema["space"])
-
-    def each(raw: Any) -> Any:
-        return tuple(map(convert, raw))
-
-    return each
 
 
 def _rows(schema: SpaceSchema) -> Converter:
@@ -95,13 +63,5 @@ def _graph(schema: SpaceSchema) -> Converter:
             "edges": None if bare else edges(raw.edges),
             "edge_links": None if bare else links(raw.edge_links),
         }
-
-    return convert
-
-
-def _one_of(converters: list[Converter]) -> Converter:
-    def convert(raw: Any) -> Any:
-        index = int(raw[0])
-        return index, converters[index](raw[1])
 
     return convert

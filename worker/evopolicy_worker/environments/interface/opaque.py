@@ -37,18 +37,17 @@ def declared(space: gymnasium.Space[Any]) -> Opaque | None:
 
 
 def visible(space: gymnasium.Space[Any], hook: Hook) -> gymnasium.Space[Any]:
-    """The space with known kinds in place of opaque ones; itself where it has none."""
+    """The space with known kinds in place of opaque ones."""
     from gymnasium import spaces
 
-    found = hook(space)
-    if found is not None:
-        return found.space
+    opaque = hook(space)
+    if opaque is not None:
+        return opaque.space
     if isinstance(space, spaces.Dict):
-        named = {key: visible(part, hook) for key, part in space.spaces.items()}
-        return space if all(named[key] is part for key, part in space.spaces.items()) else spaces.Dict(named)
+        # As pairs: of a dict, Gymnasium sorts the keys.
+        return spaces.Dict([(key, visible(part, hook)) for key, part in space.spaces.items()])
     if isinstance(space, spaces.Tuple):
-        parts = [visible(part, hook) for part in space.spaces]
-        return space if all(map(_same, parts, space.spaces)) else spaces.Tuple(parts)
+        return spaces.Tuple([visible(part, hook) for part in space.spaces])
     return space
 
 
@@ -56,9 +55,9 @@ def converter(space: gymnasium.Space[Any], hook: Hook, *, back: bool) -> Convert
     """Encodes values of a space, or decodes them (`back`); None where nothing in it is opaque."""
     from gymnasium import spaces
 
-    found = hook(space)
-    if found is not None:
-        return found.decode if back else found.encode
+    opaque = hook(space)
+    if opaque is not None:
+        return opaque.decode if back else opaque.encode
     if isinstance(space, spaces.Dict):
         named = {
             key: made for key, part in space.spaces.items() if (made := converter(part, hook, back=back))
@@ -66,15 +65,9 @@ def converter(space: gymnasium.Space[Any], hook: Hook, *, back: bool) -> Convert
         if named:
             return lambda value: {**value, **{key: made(value[key]) for key, made in named.items()}}
     if isinstance(space, spaces.Tuple):
-        parts = [converter(part, hook, back=back) or _itself for part in space.spaces]
-        if any(each is not _itself for each in parts):
-            return lambda value: tuple(made(each) for made, each in zip(parts, value, strict=True))
+        parts = [converter(part, hook, back=back) for part in space.spaces]
+        if any(parts):
+            return lambda value: tuple(
+                each if made is None else made(each) for made, each in zip(parts, value, strict=True)
+            )
     return None
-
-
-def _same(one: object, other: object) -> bool:
-    return one is other
-
-
-def _itself(value: Any) -> Any:
-    return value

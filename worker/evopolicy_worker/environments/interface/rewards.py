@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
@@ -32,9 +33,8 @@ class Scalarisation:
         The definition names the elements; otherwise the environment's `reward_space` gives their number. Raises
         WorkerError when the two disagree, or beyond `_MAX_ELEMENTS` elements.
         """
-        space = getattr(env.unwrapped, "reward_space", None)
-        shape = getattr(space, "shape", None)
-        n = int(np.prod(shape)) if shape else 0
+        shape = getattr(getattr(env.unwrapped, "reward_space", None), "shape", None)
+        n = math.prod(shape) if shape else 0
         names = entry.reward_vector or tuple(f"reward_{k}" for k in range(n))
         if not names:
             return None
@@ -65,7 +65,6 @@ class Scalarisation:
                 f"environment {self._env}, reward: a vector of {vector.size} elements, and {self._values.size} are"
                 " declared; name them all in reward_vector"
             )
-        values = vector.tolist()
-        info["reward_vector"] = values
+        info["reward_vector"] = values = vector.tolist()
         info["rewards"] = dict(zip(self.weights, values, strict=True))
         return float(vector @ self._values)

@@ -31,8 +31,8 @@ MAX_INLINE_BYTES = 4096
 """Observations of more bytes a step are stored outside the rows, as the published protocol does."""
 VARYING = ("Sequence", "Graph", "OneOf")
 """Spaces whose values differ in form."""
-USUAL_CHARACTERS = frozenset(string.ascii_letters + string.digits)
-"""Of which Text is made unless it tells `characters`."""
+USUAL_CHARACTERS = string.ascii_letters + string.digits
+"""Gymnasium's default, of which Text is made unless it tells `characters`."""
 
 
 def to_schema(space: gymnasium.Space[Any]) -> SpaceSchema:
@@ -41,27 +41,19 @@ def to_schema(space: gymnasium.Space[Any]) -> SpaceSchema:
     from gymnasium import spaces
 
     if isinstance(space, spaces.Discrete):
-        schema: SpaceSchema = {"type": "Discrete", "n": int(space.n)}
-        if int(space.start):
-            schema["start"] = int(space.start)
-        return schema
+        return {"type": "Discrete", "n": int(space.n)} | ({"start": int(space.start)} if space.start else {})
     if isinstance(space, spaces.Box):
         return _box(space.shape, space.dtype, space.low, space.high)
     if isinstance(space, spaces.MultiDiscrete):
-        schema = {"type": "MultiDiscrete", "nvec": space.nvec.tolist()}
+        schema: SpaceSchema = {"type": "MultiDiscrete", "nvec": space.nvec.tolist()}
         if np.any(space.start):
             schema["start"] = space.start.tolist()
-        if space.dtype != np.int64:
-            schema["dtype"] = str(space.dtype)
-        return schema
+        return schema if space.dtype == np.int64 else {**schema, "dtype": str(space.dtype)}
     if isinstance(space, spaces.MultiBinary):
-        n = space.n
-        return {
-            "type": "MultiBinary",
-            "n": int(n) if isinstance(n, int | np.integer) else [int(k) for k in n],
-        }
-    if isinstance(space, spaces.Tuple):
-        return {"type": "Tuple", "spaces": [to_schema(part) for part in space.spaces]}
+        return {"type": "MultiBinary", "n": np.asarray(space.n).tolist()}
+    if isinstance(space, spaces.Tuple | spaces.OneOf):
+        kind = "Tuple" if isinstance(space, spaces.Tuple) else "OneOf"
+        return {"type": kind, "spaces": [to_schema(part) for part in space.spaces]}
     if isinstance(space, spaces.Dict):
         for key in space.spaces:
             if not isinstance(key, str):
@@ -69,7 +61,7 @@ def to_schema(space: gymnasium.Space[Any]) -> SpaceSchema:
         return {"type": "Dict", "spaces": {key: to_schema(part) for key, part in space.spaces.items()}}
     if isinstance(space, spaces.Text):
         schema = {"type": "Text", "min_length": int(space.min_length), "max_length": int(space.max_length)}
-        if (characters := frozenset(space.characters)) != USUAL_CHARACTERS:
+        if (characters := frozenset(space.characters)) != frozenset(USUAL_CHARACTERS):
             schema["characters"] = "".join(sorted(characters))
         return schema
     if isinstance(space, spaces.Sequence):
@@ -84,8 +76,6 @@ def to_schema(space: gymnasium.Space[Any]) -> SpaceSchema:
     if isinstance(space, spaces.Graph):
         edges = None if space.edge_space is None else to_schema(space.edge_space)
         return {"type": "Graph", "node_space": to_schema(space.node_space), "edge_space": edges}
-    if isinstance(space, spaces.OneOf):
-        return {"type": "OneOf", "spaces": [to_schema(part) for part in space.spaces]}
     if hasattr(space, "mission_func"):
         return _mission(space)
     raise TypeError(
@@ -130,10 +120,10 @@ def bounds(schema: SpaceSchema) -> tuple[NDArray[np.float64], NDArray[np.float64
     """
     shape = tuple(schema["shape"])
     if schema["type"] == "Image":
-        lowest, highest = schema["value_range"]
-        return np.full(shape, float(lowest)), np.full(shape, float(highest))
-    low, high = (schema["low"], schema["high"]) if "low" in schema else (schema["min"], schema["max"])
-    return _floats(low, shape), _floats(high, shape)
+        low, high = schema["value_range"]
+    else:
+        low, high = (schema[name] for name in (("low", "high") if "low" in schema else ("min", "max")))
+    return _filled(low, shape), _filled(high, shape)
 
 
 Checker = Callable[[Any], str]
@@ -144,8 +134,8 @@ def compile_checker(schema: SpaceSchema) -> Checker:
     """The checker of a space."""
     kind = schema["type"]
     if kind in ("Dict", "Tuple"):
-        named = schema["spaces"].items() if kind == "Dict" else enumerate(schema["spaces"])
-        inner = [(key, compile_checker(part)) for key, part in named]
+        keys = schema["spaces"] if kind == "Dict" else range(len(schema["spaces"]))
+        inner = list(zip(keys, map(compile_checker, parts(schema)), strict=True))
         return lambda value: next(
             (f"[{key!r}] {why}" for key, check in inner if (why := check(value[key]))), ""
         )
@@ -158,15 +148,13 @@ def compile_checker(schema: SpaceSchema) -> Checker:
         item = compile_checker(schema["space"])
         return lambda value: next((f"[{k}] {why}" for k, each in enumerate(value) if (why := item(each))), "")
     if kind == "OneOf":
-        choices = [compile_checker(part) for part in schema["spaces"]]
+        choices = list(map(compile_checker, schema["spaces"]))
         return lambda value: (
             choices[value[0]](value[1])
             if 0 <= value[0] < len(choices)
             else f"choice {value[0]}, not 0 to {len(choices) - 1}"
         )
-    if kind == "Graph":
-        return lambda value: ""
-    return _array_checker(schema)
+    return _array_checker(schema) if kind != "Graph" else lambda value: ""
 
 
 def _text_checker(schema: SpaceSchema) -> Checker:
@@ -186,14 +174,10 @@ def _array_checker(schema: SpaceSchema) -> Checker:
     kind = schema["type"]
     if kind in ("Box", "Image"):
         low, high = bounds(schema)
-    elif kind == "MultiDiscrete":
-        low = np.broadcast_to(np.array(schema.get("start", 0)), np.shape(schema["nvec"]))
-        high = low + np.array(schema["nvec"]) - 1
     else:
-        low, high = np.zeros(array_of(schema)[0]), np.ones(array_of(schema)[0])
-    whole_byte = kind == "Image" or (
-        schema.get("dtype") == "uint8" and not low.any() and bool((high == 255).all())
-    )
+        low = np.broadcast_to(schema.get("start", 0), array_of(schema)[0])
+        high = low + np.array(schema.get("nvec", 2)) - 1
+    whole_byte = schema.get("dtype") == "uint8" and not low.any() and bool((high == 255).all())
 
     def check(value: NDArray[Any]) -> str:
         if value.shape != low.shape:
@@ -262,8 +246,6 @@ def _plain(value: Any) -> Any:
     return value + 0  # no negative zero
 
 
-def _floats(value: Any, shape: tuple[int, ...]) -> NDArray[np.float64]:
-    def convert(item: Any) -> Any:
-        return [convert(part) for part in item] if isinstance(item, list) else float(item)
-
-    return np.array(np.broadcast_to(np.array(convert(value), dtype=np.float64), shape))
+def _filled(value: Any, shape: tuple[int, ...]) -> NDArray[np.float64]:
+    """The numbers of a schema, one for all or nested lists, with "inf" among them."""
+    return np.array(np.broadcast_to(np.array(value, dtype=np.float64), shape))

@@ -94,23 +94,16 @@ class Promises:
 
 def _widened(schema: SpaceSchema) -> SpaceSchema:
     """The space with bounds that rounding errors do not pass."""
-    inner = schema.get("spaces")
-    if isinstance(inner, dict):
+    if isinstance(inner := schema.get("spaces"), dict):
         return {**schema, "spaces": {key: _widened(part) for key, part in inner.items()}}
     if inner is not None:
-        return {**schema, "spaces": [_widened(part) for part in inner]}
+        return {**schema, "spaces": list(map(_widened, inner))}
     if "space" in schema:
         return {**schema, "space": _widened(schema["space"])}
     if schema["type"] != "Box" or not schema["dtype"].startswith("float"):
         return schema
-    return {**schema, "low": _beyond(schema["low"], -_ROUNDING), "high": _beyond(schema["high"], _ROUNDING)}
-
-
-def _beyond(bound: Any, part: float) -> Any:
-    """Bounds as in a schema, moved outwards by a part of their size."""
-    if isinstance(bound, list):
-        return [_beyond(each, part) for each in bound]
-    return bound if isinstance(bound, str) else bound + part * max(1.0, abs(bound))
+    ends = zip(("low", "high"), spaces.bounds(schema), (-_ROUNDING, _ROUNDING), strict=True)
+    return schema | {name: (end + part * np.maximum(1.0, abs(end))).tolist() for name, end, part in ends}
 
 
 def _altered(obs: Any, raw: Any) -> str:
@@ -128,11 +121,8 @@ def _altered(obs: Any, raw: Any) -> str:
         return "" if raw == obs else f"it is {_shown(raw)}, not an integer"
     if not isinstance(obs, np.ndarray) or obs.dtype.kind == "f":
         return ""
-    given = np.asarray(raw)
-    if given.dtype == obs.dtype:
-        return ""
-    given = given.reshape(obs.shape)
-    wrong = np.argwhere(given != obs)
+    given = np.asarray(raw).reshape(obs.shape)
+    wrong = np.argwhere(given != obs) if given.dtype != obs.dtype else ()
     if not len(wrong):
         return ""
     where = tuple(wrong[0].tolist())
@@ -147,21 +137,27 @@ def misshapen(returned: Any, error: Exception, *, vector: bool) -> str:
             f"returned values: {_shown(returned)}; it has to return observation, reward, terminated, truncated and"
             " info, as Gymnasium 1.x has it"
         )
-    obs, reward, terminated, truncated, info = returned
-    remedy = "numbers, one for each name in reward_vector" if vector else "one number"
-    rest = "" if vector else ", or its elements be named in reward_vector"
-    fields: tuple[tuple[str, Any, Callable[[Any], object], str], ...] = (
-        ("reward", reward, _numbers if vector else float, f"a reward has to be {remedy}{rest}"),
-        ("terminated", terminated, bool, "it has to be true or false"),
-        ("truncated", truncated, bool, "it has to be true or false"),
-        ("info", info, _items, "it has to be a dict"),
+    remedy = (
+        "numbers, one for each name in reward_vector"
+        if vector
+        else "one number, or its elements be named in reward_vector"
     )
-    for name, value, read, wanted in fields:
+    fields: tuple[tuple[str, Callable[[Any], object], str], ...] = (
+        (
+            "reward",
+            (lambda value: np.asarray(value, np.float64)) if vector else float,
+            f"a reward has to be {remedy}",
+        ),
+        ("terminated", bool, "it has to be true or false"),
+        ("truncated", bool, "it has to be true or false"),
+        ("info", lambda value: value.items() if value else None, "it has to be a dict"),
+    )
+    for value, (name, read, wanted) in zip(returned[1:], fields, strict=True):
         try:
             read(value)
         except (TypeError, ValueError, OverflowError, AttributeError):
             return f"{name}: it is {_shown(value)}; {wanted}"
-    return no_observation(obs, error)
+    return no_observation(returned[0], error)
 
 
 def no_observation(obs: Any, error: Exception) -> str:
@@ -170,14 +166,6 @@ def no_observation(obs: Any, error: Exception) -> str:
         f"observation: it is {_shown(obs)}, and cannot be read as its observation_space tells ({type(error).__name__}:"
         f" {one_line(str(error))[:120]}); correct one of them"
     )
-
-
-def _numbers(value: Any) -> object:
-    return np.asarray(value, dtype=np.float64)
-
-
-def _items(value: Any) -> object:
-    return value.items() if value else None
 
 
 def _shown(value: Any) -> str:
@@ -198,25 +186,18 @@ def play(environment: Environment) -> None:
         for seed in SEEDS:
             environment.reset(Case(seed=seed))
             for _ in range(STEPS):
-                step = environment.step(_sampled(environment, rng))
+                try:
+                    action = environment.action_codec.sample(rng)
+                except Exception as error:
+                    raise WorkerError(
+                        f"environment {environment.description.env}, action_space: no random action can be drawn from"
+                        f" it ({type(error).__name__}: {error}); correct its bounds"
+                    ) from error
+                step = environment.step(action)
                 if step.terminated or step.truncated:
                     break
     except EvopolicyError:
         raise
     except BaseException as error:  # such as an environment's sys.exit
-        remedy = (
-            "it has to take any seed"
-            if call.what == "reset"
-            else "it has to take any action of its action_space"
-        )
-        raise WorkerError(f"{call}: it raised {described(error)}; {remedy}") from error
-
-
-def _sampled(environment: Environment, rng: np.random.Generator) -> Any:
-    try:
-        return environment.action_codec.sample(rng)
-    except Exception as error:
-        raise WorkerError(
-            f"environment {environment.description.env}, action_space: no random action can be drawn from it"
-            f" ({type(error).__name__}: {error}); correct its bounds"
-        ) from error
+        wanted = "seed" if call.what == "reset" else "action of its action_space"
+        raise WorkerError(f"{call}: it raised {described(error)}; it has to take any {wanted}") from error
