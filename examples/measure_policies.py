@@ -18,7 +18,7 @@ import fnmatch
 import importlib.util
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -68,31 +68,30 @@ def play(environment: Environment, policy: Any, seed: int, max_steps: int) -> tu
             return total, steps, invalid, thinking
 
 
+def play_all(
+    environment: Environment, folder: Path, seeds: Sequence[int], max_steps: int
+) -> list[tuple[float, int, int, float]]:
+    """Plays an episode a seed, each with a fresh instance of the folder's policy; see `play`."""
+    about = environment.description
+    meta = {"env": about.env, "submit_index": 0, "n_episodes_this_submit": len(seeds)}
+    meta |= {"remaining_budget_after": 0, "max_episode_steps": about.max_episode_steps}
+    meta |= {
+        "obs_space": about.obs_space,
+        "action_space": about.action_space,
+        "obs_storage": about.obs_storage,
+    }
+    with policy_class(folder) as new:
+        return [
+            play(environment, new(about.obs_space, about.action_space, meta), seed, max_steps)
+            for seed in seeds
+        ]
+
+
 def measure(env_id: str, seeds: range, *, show_returns: bool) -> str:
     """Play one environment's policy over `seeds`; its row of the table."""
     environment = make(env_id)
-    description = environment.description
-    max_steps = entry(env_id).published_steps or description.max_episode_steps
-    env_meta = {
-        "env": env_id,
-        "submit_index": 0,
-        "n_episodes_this_submit": len(seeds),
-        "remaining_budget_after": 0,
-        "max_episode_steps": max_steps,
-        "obs_space": description.obs_space,
-        "action_space": description.action_space,
-        "obs_storage": description.obs_storage,
-    }
-    with policy_class(policy_folder(POLICIES, env_id)) as new_policy:
-        episodes = [
-            play(
-                environment,
-                new_policy(description.obs_space, description.action_space, env_meta),
-                seed,
-                max_steps,
-            )
-            for seed in seeds
-        ]
+    max_steps = entry(env_id).published_steps or environment.description.max_episode_steps
+    episodes = play_all(environment, policy_folder(POLICIES, env_id), seeds, max_steps)
     environment.close()
     returns, steps, invalid, thinking = (np.array(column) for column in zip(*episodes, strict=True))
     if show_returns:

@@ -20,7 +20,7 @@ TOP = Path(__file__).parents[2]
 sys.path[:0] = [str(TOP / "examples"), str(TOP / "tests" / "support")]
 
 import proofs  # noqa: E402
-from measure_policies import POLICIES, play, policy_class  # noqa: E402
+from measure_policies import POLICIES, play, play_all  # noqa: E402
 
 from evopolicy_common import catalogue  # noqa: E402
 from evopolicy_common.catalogue import anchors, installs  # noqa: E402
@@ -63,24 +63,17 @@ class Uniform:
 
 def measured(returns: list[float]) -> Measured:
     values = np.array(returns)
-    found = over_cases(values, (values[None, :],))
-    ends = (None if each is None else round(each, 5) for each in (found.low, found.high))
-    return Measured(mean=round(found.value, 5), **dict(zip(("low", "high"), ends, strict=True)))
+    interval = over_cases(values, (values[None, :],))
+    low, high = (None if each is None else round(each, 5) for each in (interval.low, interval.high))
+    return Measured(mean=round(interval.value, 5), low=low, high=high)
 
 
 def measure(env_id: str, folder: Path) -> Anchor:
     environment = make(env_id)
-    about = environment.description
-    most = catalogue.entry(env_id).published_steps or about.max_episode_steps or sys.maxsize
-    meta = {"env": env_id, "submit_index": 0, "n_episodes_this_submit": N_CASES, "remaining_budget_after": 0}
-    meta |= {"max_episode_steps": about.max_episode_steps, "obs_storage": about.obs_storage}
-    meta |= {"obs_space": about.obs_space, "action_space": about.action_space}
+    most = catalogue.entry(env_id).published_steps or environment.description.max_episode_steps or sys.maxsize
     seeds = cases(env_id)
     random = [play(environment, Uniform(environment, seed), seed, most)[0] for seed in seeds]
-    with policy_class(folder) as new:
-        best = [
-            play(environment, new(about.obs_space, about.action_space, meta), seed, most)[0] for seed in seeds
-        ]
+    best = [each[0] for each in play_all(environment, folder, seeds, most)]
     environment.close()
     where = str(folder.relative_to(TOP))
     return Anchor(random=measured(random), best=measured(best), cases=N_CASES, policy=where)

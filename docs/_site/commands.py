@@ -18,14 +18,10 @@ from evopolicy_worker.cli import app as worker
 
 def page() -> str:
     """The page's Markdown."""
+    apps = {"": front, "-coordinator": coordinator, "-worker": worker, "-gateway": gateway}
     parts = ["# Commands\n\nEvery command has `--help` with an example.\n"]
-    for name, app in (
-        ("evopolicy", front),
-        ("evopolicy-coordinator", coordinator),
-        ("evopolicy-worker", worker),
-        ("evopolicy-gateway", gateway),
-    ):
-        parts += _described(name, typer.main.get_command(app), 2)
+    for name, app in apps.items():
+        parts += _described(f"evopolicy{name}", typer.main.get_command(app), 2)
     return "\n".join(parts)
 
 
@@ -58,13 +54,9 @@ def _choices(annotation: Any) -> list[str]:
 
 
 def _cell(option: Any) -> str:
-    text = " ".join((getattr(option, "help", None) or "").split())
-    default = option.default
-    if (
-        default not in (None, False, (), [])
-        and getattr(option, "show_default", False)
-        and not callable(default)
-    ):
+    text, default = " ".join((getattr(option, "help", None) or "").split()), option.default
+    shown = getattr(option, "show_default", False) and not callable(default)
+    if shown and default not in (None, False, (), []):
         text += f" Default: {default}."
     return _cell_text(text)
 

@@ -52,28 +52,20 @@ def table() -> str:
             how + (" and Chromium" if row.browser else ""),
         )
         lines.append(f"| {' | '.join(cells)} |")
-    lines += [
-        "",
-        (
-            f"The {len(families)} suites hold {_total(families):,} environments; the suite `paper13` holds the"
-            f" {len(named)} families that the paper"
-        ),
-        (
-            f"names. The paper validates its protocol on {original['paper']['validated']} tasks. The newest version of"
-            " the original software has"
-        ),
-        (
-            f"about {newest['profiles']} environment profiles in {newest['ecosystems']} ecosystems, each with its own"
-            " lock file. *Deterministic*: ids whose episodes depend"
-        ),
-        "only on seed and actions. *Played*: ids that `check-env` has played.",
-        CPU,
-        "",
-        "The newest version of the original also has, and we do not offer:",
-        "",
-        *(f"- {name}: {why}" for name, why in newest["left_out"].items()),
-    ]
-    return "\n".join(lines)
+    paper = original["paper"]
+    lacking = "\n".join(f"- {name}: {why}" for name, why in newest["left_out"].items())
+    rows = "\n".join(lines)
+    return f"""{rows}
+
+The {len(families)} suites hold {_total(families):,} environments; the suite `paper13` holds the {len(named)} families that the paper
+names. The paper validates its protocol on {paper["validated"]} tasks. The newest version of the original software has
+about {newest["profiles"]} environment profiles in {newest["ecosystems"]} ecosystems, each with its own lock file. *Deterministic*: ids whose episodes depend
+only on seed and actions. *Played*: ids that `check-env` has played.
+{CPU}
+
+The newest version of the original also has, and we do not offer:
+
+{lacking}"""  # noqa: E501
 
 
 def short() -> str:
@@ -82,33 +74,21 @@ def short() -> str:
     named = original["paper"]["families"]
     total, deterministic = _total(families), sum(map(_deterministic, families))
     played = sum(each in _tables()[0] for suite in families for each in suite.environments)
-    every = (
-        "All ids are"
-        if deterministic == sum(len(suite.environments) for suite in families)
-        else f"{deterministic:,} ids are"
+    ids = sum(len(suite.environments) for suite in families)
+    every = "All ids are" if deterministic == ids else f"{deterministic:,} ids are"
+    rows = "\n".join(
+        f"| {f'**`{suite.name}`**' if suite.name in named else f'`{suite.name}`'}"
+        f" | {len(suite.environments):,} | {' | '.join(_cost(suite))} |"
+        for suite in families
     )
-    return "\n".join(
-        [
-            "| suite | environments | measured | CPU ms, bare | CPU ms, slot |",
-            "|---|--:|--:|--:|--:|",
-            *(
-                f"| {f'**`{suite.name}`**' if suite.name in named else f'`{suite.name}`'}"
-                f" | {len(suite.environments):,} | {' | '.join(_cost(suite))} |"
-                for suite in families
-            ),
-            "",
-            (
-                f"The {len(families)} suites hold {total:,} environments; the paper names the families in bold"
-                f" (together `paper13`). {every}"
-            ),
-            (
-                "deterministic: seed and actions determine the episode. `evopolicy-worker check-env ID` plays an"
-                " environment in two processes"
-            ),
-            f"and compares the episodes; it has confirmed {'all' if played == total else f'{played:,}'} ids.",
-            CPU,
-        ]
-    )
+    return f"""| suite | environments | measured | CPU ms, bare | CPU ms, slot |
+|---|--:|--:|--:|--:|
+{rows}
+
+The {len(families)} suites hold {total:,} environments; the paper names the families in bold (together `paper13`). {every}
+deterministic: seed and actions determine the episode. `evopolicy-worker check-env ID` plays an environment in two processes
+and compares the episodes; it has confirmed {"all" if played == total else f"{played:,}"} ids.
+{CPU}"""  # noqa: E501
 
 
 MARKS = {

@@ -36,21 +36,19 @@ def on_files(files: Files, config: Any) -> Files:
 
 def on_page_markdown(markdown: str, page: Any, config: Any, files: Files) -> str:
     """Leads links between root and `docs/` to the site's pages; a file that is no page keeps its name only."""
-    place = {page: source for source, page in ROOT_PAGES.items()}.get(
-        page.file.src_uri, f"docs/{page.file.src_uri}"
-    )
+    sources = {place: source for source, place in ROOT_PAGES.items()}
+    place = sources.get(page.file.src_uri, f"docs/{page.file.src_uri}")
 
     def led(match: re.Match[str]) -> str:
         picture, label, target, anchor = match.groups()
         if "://" in target:
             return match.group(0)
         source = posixpath.normpath(posixpath.join(posixpath.dirname(place), target))
-        uri = (ROOT_PAGES | FILES).get(source) or (
-            source.removeprefix("docs/") if source.startswith("docs/") else None
-        )
-        if uri is None and posixpath.exists(posixpath.join(posixpath.dirname(config["docs_dir"]), source)):
+        inside = source.removeprefix("docs/") if source.startswith("docs/") else ""
+        uri = (ROOT_PAGES | FILES).get(source) or inside
+        if not uri and posixpath.exists(posixpath.join(posixpath.dirname(config["docs_dir"]), source)):
             return label
-        if uri is None or files.get_file_from_path(uri) is None:
+        if not uri or files.get_file_from_path(uri) is None:
             return match.group(0)
         return f"{picture}[{label}]({posixpath.relpath(uri, posixpath.dirname(page.file.src_uri) or '.')}{anchor or ''})"  # noqa: E501
 

@@ -49,18 +49,10 @@ installation, an image of one, or pictures of such an environment.
 def licence_of(package: Distribution) -> str:
     """The SPDX expression, or else the first line of the licence's field, or the classifiers."""
     fields = package.metadata
-    first = next(iter((fields.get("License") or "").strip().splitlines()), "").strip()
-    classified = [
-        each.rpartition("::")[2].strip()
-        for each in fields.get_all("Classifier") or ()
-        if each.startswith("License ::")
-    ]
-    return (
-        fields.get("License-Expression")
-        or (first if len(first) <= 60 else "")
-        or ", ".join(classified)
-        or UNKNOWN
-    )
+    first = (fields.get("License") or "").strip().partition("\n")[0].strip()
+    classifiers = (each.split("::") for each in fields.get_all("Classifier") or ())
+    classified = ", ".join(last.strip() for kind, *_, last in classifiers if kind == "License ")
+    return fields.get("License-Expression") or (first if len(first) <= 60 else "") or classified or UNKNOWN
 
 
 def required() -> Iterator[tuple[str, str, str]]:
@@ -104,17 +96,16 @@ def rows(folders: Iterable[str] = ()) -> list[Licence]:
 
 def page(listed: Iterable[Licence]) -> str:
     """THIRD_PARTY.md."""
-    lines = ["", "| package | version | licence | used by |", "|---|---|---|---|"]
-    lines += [
-        f"| {each.what} | {each.version} | {each.licence} | {', '.join(each.used_by)} |" for each in listed
-    ]
-    own = ["", "| family | asset | licence |", "|---|---|---|"]
-    own += [f"| {each.used_by[0]} | {each.what} | {each.licence} |" for each in assets()]
-    return "\n".join([HEAD.rstrip(), *lines, ASSETS.rstrip(), *own, ""])
+    lines = [HEAD.rstrip(), "", "| package | version | licence | used by |", "|---|---|---|---|"]
+    for each in listed:
+        lines.append(f"| {each.what} | {each.version} | {each.licence} | {', '.join(each.used_by)} |")
+    lines += [ASSETS.rstrip(), "", "| family | asset | licence |", "|---|---|---|"]
+    lines += [f"| {each.used_by[0]} | {each.what} | {each.licence} |" for each in assets()]
+    return "\n".join([*lines, ""])
 
 
 if __name__ == "__main__":
-    found = rows(sys.argv[1:])
-    DATA.write_bytes(b"[\n" + b",\n".join(map(msgspec.json.encode, found)) + b"\n]\n")
+    table = rows(sys.argv[1:])
+    DATA.write_bytes(b"[\n" + b",\n".join(map(msgspec.json.encode, table)) + b"\n]\n")
     packages.cache_clear()
-    PAGE.write_text(page(found), encoding="utf-8")
+    PAGE.write_text(page(table), encoding="utf-8")

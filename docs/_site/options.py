@@ -23,9 +23,9 @@ def page() -> Iterator[str]:
         " [Commands](cli.md) has the options of every command, with those of a local cluster."
     )
     options = [one for each in (RunOptions, JailSettings, ListenerOptions) for one in declared(each).items()]
-    for group, found in groupby(options, lambda each: each[1].group):
+    for group, members in groupby(options, lambda each: each[1].group):
         yield f"\n## {group}\n\n| option | suite file | Python | default | meaning |\n|---|---|---|---|---|"
-        for name, one in found:
+        for name, one in members:
             everywhere = name in RunOptions.__struct_fields__
             suite = f"`{name}`" if everywhere and one.option.suite is not None else ""
             if name in JailSettings.__struct_fields__:

@@ -20,12 +20,8 @@ def draw(run: Path, out: Path) -> None:
     assert outcome.random_reference is not None
     assert outcome.heldout_returns is not None
     assert outcome.val_scores is not None
-    matplotlib.rcParams |= {
-        "svg.hashsalt": "score",
-        "font.size": 9,
-        "axes.spines.top": False,
-        "axes.spines.right": False,
-    }
+    matplotlib.rcParams |= {"svg.hashsalt": "score", "font.size": 9}
+    matplotlib.rcParams |= dict.fromkeys(("axes.spines.top", "axes.spines.right"), False)
     figure, (left, right) = pyplot.subplots(1, 2, figsize=(8, 3), width_ratios=(3, 2), layout="constrained")
     submits = sorted(map(int, outcome.val_scores))
     means = [outcome.val_scores[str(each)] for each in submits]
@@ -41,21 +37,11 @@ def draw(run: Path, out: Path) -> None:
         values = np.array(returns, float)
         mean = intervals.over_cases(values)
         right.plot(np.full(len(values), place), values, "_", color="0.6", markersize=14)
-        right.errorbar(
-            place + 0.25,
-            mean.value,
-            [[mean.value - mean.low], [mean.high - mean.value]],
-            fmt="o",
-            color="#b3541e",
-            capsize=3,
-        )
+        ends = [[mean.value - mean.low], [mean.high - mean.value]]
+        right.errorbar(place + 0.25, mean.value, ends, fmt="o", color="#b3541e", capsize=3)
         right.annotate(f"{mean.value:.1f}", (place + 0.32, mean.value), va="center", color="#b3541e")
-    right.set(
-        title="2  Returns on hidden held-out cases",
-        xticks=range(len(rows)),
-        xticklabels=rows,
-        xlim=(-0.4, 1.8),
-    )
+    right.set(title="2  Returns on hidden held-out cases", xlim=(-0.4, 1.8))
+    right.set(xticks=range(len(rows)), xticklabels=rows)
     figure.savefig(out, metadata={"Date": None})
 
 

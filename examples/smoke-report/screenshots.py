@@ -1,6 +1,9 @@
-"""Screenshots of a report in a headless Chromium, small enough to be kept: docs/how-to/reports.md shows them.
+"""Screenshots of a report or of a live view in a headless Chromium, small enough to be kept: docs/how-to/reports.md and
+docs/how-to/watch.md show them.
 
-PYTHONPATH=tests/support python examples/smoke-report/screenshots.py REPORT OUT
+PYTHONPATH=tests/support python examples/smoke-report/screenshots.py REPORT|ADDRESS OUT
+
+ADDRESS is what `evopolicy web` prints, of a view with a cluster and a run that has several submits.
 """
 
 from __future__ import annotations
@@ -27,6 +30,10 @@ VIDEOS = """Promise.all([...document.querySelectorAll('video')].map((video) => n
 })))"""
 
 
+MOST_SUBMITS = """[...document.querySelectorAll('#run-rows tr')].sort((a, b) =>
+  b.children[6].textContent - a.children[6].textContent)[0].querySelector('a').href"""
+
+
 def shoot(page: Page, out: Path) -> None:
     """The window as it is now."""
     with tempfile.NamedTemporaryFile(suffix=".png") as file:
@@ -36,35 +43,59 @@ def shoot(page: Page, out: Path) -> None:
     print(f"{out}: {out.stat().st_size >> 10} KiB")
 
 
-def main() -> None:
+def report_pages(page: Page, report: Path, out: Path) -> None:
     """Front page in light, dark and on a phone; its sections; a run's page, and a replays page if there is one."""
-    report, out = Path(sys.argv[1]), Path(sys.argv[2])
+    page.look(width=1280, height=1000)
+    page.open(report / "index.html")
+    for name, dark in (("report-light", False), ("report-dark", True)):
+        page.look(width=1280, height=1000, dark=dark)
+        shoot(page, out / f"{name}.png")
+    page.look(width=1280, height=1000)
+    for section in ("evolution", "demand", "edits", "timelines", "cost"):
+        page.run(PICK)
+        page.run(TO_SECTION % f"section[id^={section}], section[aria-labelledby^={section}]")
+        shoot(page, out / f"report-{section}.png")
+    page.look(width=390, height=844, phone=True)
+    page.open(report / "index.html")
+    shoot(page, out / "report-phone.png")
+    page.look(width=1280, height=690)
+    replays = report / "replays" / "gym-racing.html"
+    if replays.is_file():
+        page.open(replays)
+        assert all(page.run(VIDEOS))
+        page.run("new Promise((done) => setTimeout(done, 500))")  # the frames are painted
+        shoot(page, out / "report-replays.png")
+    trace = min((report / "traces").glob("gym-racing-*.html"))
+    page.look(width=1280, height=1400)
+    page.open(trace)
+    shoot(page, out / "report-trace.png")
+
+
+def view_pages(page: Page, address: str, out: Path) -> None:
+    """All runs, one run and the cluster in the dark, all runs on a phone."""
+    base, run = address.partition("/login")[0], ""
+    for name, place, look in (
+        ("web-runs", address, {"width": 1280, "height": 1000}),
+        ("web-run-dark", "", {"width": 1280, "height": 1300, "dark": True}),
+        ("web-cluster-dark", f"{base}/cluster", {"width": 1280, "height": 1300, "dark": True}),
+        ("web-phone", f"{base}/", {"width": 390, "height": 844, "phone": True}),
+    ):
+        page.look(**look)
+        page.visit(place or run)
+        page.until("document.getElementById('live')?.textContent === 'live'")
+        shoot(page, out / f"{name}.png")
+        run = run or page.run(MOST_SUBMITS)
+
+
+def main() -> None:
+    """Takes them all."""
+    source, out = sys.argv[1], Path(sys.argv[2])
     out.mkdir(parents=True, exist_ok=True)
     with Page() as page:
-        page.look(width=1280, height=1000)
-        page.open(report / "index.html")
-        for name, dark in (("report-light", False), ("report-dark", True)):
-            page.look(width=1280, height=1000, dark=dark)
-            shoot(page, out / f"{name}.png")
-        page.look(width=1280, height=1000)
-        for section in ("evolution", "demand", "edits", "timelines", "cost"):
-            page.run(PICK)
-            page.run(TO_SECTION % f"section[id^={section}], section[aria-labelledby^={section}]")
-            shoot(page, out / f"report-{section}.png")
-        page.look(width=390, height=844, phone=True)
-        page.open(report / "index.html")
-        shoot(page, out / "report-phone.png")
-        page.look(width=1280, height=690)
-        replays = report / "replays" / "gym-racing.html"
-        if replays.is_file():
-            page.open(replays)
-            assert all(page.run(VIDEOS))
-            page.run("new Promise((done) => setTimeout(done, 500))")  # the frames are painted
-            shoot(page, out / "report-replays.png")
-        trace = min((report / "traces").glob("gym-racing-*.html"))
-        page.look(width=1280, height=1400)
-        page.open(trace)
-        shoot(page, out / "report-trace.png")
+        if source.startswith("http"):
+            view_pages(page, source, out)
+        else:
+            report_pages(page, Path(source), out)
         assert page.problems == [], page.problems
 
 

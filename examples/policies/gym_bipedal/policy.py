@@ -68,11 +68,8 @@ class Policy:
         return np.clip(POWER * torques.ravel(), -1.0, 1.0)
 
     def wanted_angles(self, swing, stand):
-        """Wanted angles of the swinging hip (None: only hold the hull), the swinging knee and the standing
-        knee.
-
-        Passes on to the next phase where that is due.
-        """
+        """Wanted angles of the swinging hip (None: only hold the hull), the swinging and the standing knee; passes
+        on to the next phase where that is due."""
         if self.phase == SWING and stand[HIP] < HIP_BEHIND:
             self.stand_knee = min(self.stand_knee + STAND_KNEE_RISE, STAND_KNEE)
             self.phase = LAND

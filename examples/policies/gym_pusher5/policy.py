@@ -43,9 +43,7 @@ def wrist_of(lift, roll, elbow):
 
 
 def posture_table():
-    """Postures whose wrist is low: rows of (lift, roll, elbow), and their wrists as (distance, direction,
-    height).
-    """
+    """Postures with a low wrist: rows of (lift, roll, elbow), and of the wrists' (distance, direction, height)."""
     grid = itertools.product(np.linspace(0, 1.39, 48), np.linspace(-1.4, 1.4, 9), np.linspace(-2.3, 0, 48))
     postures = np.array(list(grid))
     x, y, z = wrist_of(*postures.T)
@@ -57,9 +55,7 @@ POSTURES, WRISTS = posture_table()
 
 
 def posture_for(place, height, angles):
-    """Pan, lift, roll and elbow that bring the wrist over a place on the table, near to the present
-    angles.
-    """
+    """Pan, lift, roll and elbow, near to the present ones, that bring the wrist over a place on the table."""
     distance, direction = math.hypot(*(place - BASE)), math.atan2(*(place - BASE)[::-1])
     miss = ((WRISTS[:, 0] - distance) ** 2 + (WRISTS[:, 2] - height) ** 2) / 0.01**2
     pan = direction - WRISTS[:, 1]

@@ -67,9 +67,7 @@ def read_speed(obs):
 
 
 def trace_road(obs):
-    """Points (x to the right, y ahead, in units from the car) on the road's middle, the car's own place
-    first.
-    """
+    """Points (x to the right, y ahead, in units from the car) on the road's middle, the car's place first."""
     road = obs[:84, :, 1] <= obs[:84, :, 0].astype(np.int16) + GREEN
     x, y, angle = 0.0, 0.0, 0.0
     points = [(x, y)]
@@ -91,9 +89,7 @@ def trace_road(obs):
 
 
 def middle_of(seen):
-    """Middle, in units from the centre, of the stretch of road nearest to a scan's centre; None without
-    road.
-    """
+    """Middle of the stretch of road nearest to a scan's centre, in units from there; None without road."""
     here = min((i for i, road in enumerate(seen) if road), key=lambda i: abs(i - CENTRE), default=None)
     if here is None:
         return None

@@ -16,9 +16,7 @@ PUSH_HEIGHT = 0.425
 CLEAR_HEIGHT = 0.515
 """z from which on the gripper passes over the block without touching it."""
 BEHIND = 0.075
-"""How far behind the block's centre the push starts (m): half of block and fingers together, with some
-air.
-"""
+"""Distance behind the block's centre at which the push starts (m): half of block and fingers, and some air."""
 IN_LINE = 0.02
 """How far beside the line of the push the gripper may be when it starts (m)."""
 TOUCH = 0.07

@@ -48,9 +48,7 @@ def put_down(world, then=None):
 
 
 def cost_to_face(world, thing, start, blocked):
-    """Steps from a pose until `thing` is right ahead, with one more cell blocked; None when it can't be
-    reached.
-    """
+    """Steps from a pose until `thing` is right ahead, with one more cell blocked; None if there is no way."""
     for cost, cell, direction, _ in world.poses({blocked}, start):
         if cell + STEP[direction] == thing:
             return cost

@@ -49,9 +49,7 @@ class GridMap:
         self.state = [0] * cells
         self.unseen = bytearray([YES]) * cells
         self.clear = bytearray([YES]) * cells
-        """Cells that can be seen through, the unseen ones hopefully; digits, so that a slice reads as a
-        binary number.
-        """
+        """Cells that can be seen through, or are unseen; as digits, so that a slice reads as a binary number."""
         self.cell = START
         self.direction = 0
         self.carried = None
@@ -151,9 +149,7 @@ class GridMap:
                     heapq.heappush(queue, (cost + entry, target, direction, here))
 
     def route(self, arrived, blocked=()):
-        """Poses on the quickest way to the first pose for which `arrived(cell, direction)`; None if there is
-        none.
-        """
+        """Poses on the quickest way to the first one for which `arrived(cell, direction)`; None without one."""
         before = {}
         for _, cell, direction, previous in self.poses(blocked):
             before[cell, direction] = previous
@@ -185,9 +181,7 @@ class GridMap:
     # -- looking
 
     def expect_wall(self, cell):
-        """Take an unseen cell for a wall until it is seen: it hides what is behind it, and is still worth a
-        look.
-        """
+        """Take an unseen cell for a wall that hides the cells behind it, until it is seen."""
         if self.kind[cell] == UNSEEN:
             self.clear[cell] = NO
 
@@ -209,9 +203,7 @@ class GridMap:
         return total
 
     def route_to_news(self, patience=3):
-        """The way to the pose that shows most for its cost, (novelty / (cost + patience)); None when all is
-        seen.
-        """
+        """The way to the pose with the most novelty / (cost + patience); None when all is seen."""
         before, best, goal = {}, 0.0, None
         for cost, cell, direction, previous in self.poses():
             before[cell, direction] = previous

@@ -112,9 +112,7 @@ def way_done(position):
 
 
 def advance(cars, seconds):
-    """Forecast of cars, rows of (x, y, vx, vy): round the centre at constant speed, or straight on
-    outside.
-    """
+    """Forecast of cars, rows of (x, y, vx, vy), at constant speed: round the centre, or straight on outside."""
     x, y, vx, vy = cars[..., 0], cars[..., 1], cars[..., 2], cars[..., 3]
     radius = np.maximum(np.hypot(x, y), 1.0)
     going_round = (radius < RING_M) & (np.abs(x * vy - y * vx) > 0.5 * radius * np.hypot(vx, vy))

@@ -8,11 +8,13 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
+import subprocess
 import sys
 from typing import Any
 
 from evopolicy_common.catalogue import suites
-from evopolicy_worker.environments import Environment, make
+from evopolicy_worker.environments import Environment, make, process_environment
 from evopolicy_worker.environments.checks.episodes import add, rollout
 
 IDS = [*suites()["core16"].environments, *suites()["toy"].environments]
@@ -40,6 +42,22 @@ def value_digest(value: Any) -> str:
     state = hashlib.sha256()
     add(state, value)
     return state.hexdigest()[:16]
+
+
+def elsewhere(mode: str, *ids: str) -> dict[str, list[str]]:
+    """The digests that this program prints, played in another process, as its environment is at its start."""
+    result = subprocess.run(
+        [sys.executable, __file__, mode, *ids],
+        env={"PATH": os.environ["PATH"], **process_environment(render=mode == "render")},
+        capture_output=True,
+        text=True,
+        timeout=170,
+        check=False,
+    )
+    assert result.returncode == 0, result.stderr
+    assert mode == "render" or result.stderr == ""
+    played: dict[str, list[str]] = json.loads(result.stdout)
+    return played
 
 
 def main(mode: str, ids: list[str]) -> None:

@@ -3,21 +3,16 @@
 from __future__ import annotations
 
 import copy
-import json
-import os
-import subprocess
-import sys
 from collections.abc import Callable
 from contextlib import nullcontext
-from pathlib import Path
 
 import numpy as np
 import pytest
-from environment_checks import IDS, SEED, STEPS, play
+from environment_checks import IDS, SEED, STEPS, elsewhere, play
 
 from evopolicy_common.catalogue import entry
 from evopolicy_common.messages.environment import Case
-from evopolicy_worker.environments import Environment, make, process_environment
+from evopolicy_worker.environments import Environment, make
 from evopolicy_worker.environments.families.box2d import Box2DFamily
 
 Warm = Callable[[str], Environment]
@@ -32,20 +27,9 @@ def fresh_episode(env_id: str) -> list[str]:
 
 
 @pytest.fixture(scope="session")
-def elsewhere() -> dict[str, list[str]]:
+def played() -> dict[str, list[str]]:
     """Episodes of all ids, played in one other process, each after those of all ids behind it in the catalogue."""
-    result = subprocess.run(
-        [sys.executable, str(Path(__file__).with_name("environment_checks.py")), "play"],
-        env={"PATH": os.environ["PATH"], **process_environment()},
-        capture_output=True,
-        text=True,
-        timeout=170,
-        check=False,
-    )
-    assert result.returncode == 0, result.stderr
-    assert result.stderr == ""
-    played: dict[str, list[str]] = json.loads(result.stdout)
-    return played
+    return elsewhere("play")
 
 
 @pytest.mark.parametrize("env_id", IDS)
@@ -62,8 +46,8 @@ def test_a_reused_environment_plays_the_same_episode_as_a_fresh_one(env_id: str,
 
 
 @pytest.mark.parametrize("env_id", IDS)
-def test_another_process_plays_the_same_episode(env_id: str, elsewhere: dict[str, list[str]]) -> None:
-    assert fresh_episode(env_id) == elsewhere[env_id]
+def test_another_process_plays_the_same_episode(env_id: str, played: dict[str, list[str]]) -> None:
+    assert fresh_episode(env_id) == played[env_id]
 
 
 @pytest.mark.parametrize("env_id", IDS)

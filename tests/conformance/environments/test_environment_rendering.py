@@ -4,13 +4,9 @@ from __future__ import annotations
 
 import ctypes.util
 import json
-import os
-import subprocess
-import sys
-from pathlib import Path
 
 import pytest
-from environment_checks import FRAMES, IDS, play
+from environment_checks import FRAMES, IDS, elsewhere, play
 
 from evopolicy_common.errors import WorkerError
 from evopolicy_worker.environments import make, process_environment
@@ -23,17 +19,7 @@ DRAWABLE = [env_id for env_id in IDS if env_id not in DRAWS_WITH_EGL or ctypes.u
 @pytest.fixture(scope="session")
 def rendered() -> dict[str, list[str]]:
     """Episodes of all ids with a frame per step. In a process of its own: the driver is chosen at its start."""
-    result = subprocess.run(
-        [sys.executable, str(Path(__file__).with_name("environment_checks.py")), "render", *DRAWABLE],
-        env={"PATH": os.environ["PATH"], **process_environment(render=True)},
-        capture_output=True,
-        text=True,
-        timeout=170,
-        check=False,
-    )
-    assert result.returncode == 0, result.stderr
-    played: dict[str, list[str]] = json.loads(result.stdout)
-    return played
+    return elsewhere("render", *DRAWABLE)
 
 
 @pytest.mark.parametrize("env_id", DRAWABLE)

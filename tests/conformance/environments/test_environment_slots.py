@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable
 
 import numpy as np
@@ -9,7 +10,6 @@ import pytest
 from environment_checks import IDS
 from slots import Slots, make_job, rows
 
-from evopolicy_common.messages.environment import Case
 from evopolicy_common.messages.episode import ResourceLimits
 from evopolicy_worker.environments import Environment
 
@@ -57,8 +57,6 @@ def test_a_slot_plays_what_the_environment_plays(
     namespace: dict[str, object] = {}
     exec(POLICY, namespace)
     mark: Callable[[object, object], None] = namespace["mark"]  # type: ignore[assignment]
-    import hashlib
-
     outcome = slots.play(POLICY, env=env_id, seed=SEED, limits=ResourceLimits())
     assert outcome.failure is None
     played = rows(outcome)
@@ -67,7 +65,7 @@ def test_a_slot_plays_what_the_environment_plays(
     assert len(words) == min(60, outcome.length)
     assert (played[-1].terminated, played[-1].truncated) == (outcome.terminated, outcome.truncated)
     environment = warm(env_id)
-    obs = environment.reset(make_case())
+    obs = environment.reset(make_job(seed=SEED).episodes[0].case)
     total = 0.0
     for row, digest in zip(played[:COMPARED_STEPS], words, strict=True):
         for seen in (obs, row.obs):
@@ -79,7 +77,3 @@ def test_a_slot_plays_what_the_environment_plays(
         total += reward
     if outcome.length <= COMPARED_STEPS:
         assert total == outcome.episode_return
-
-
-def make_case() -> Case:
-    return make_job(seed=SEED).episodes[0].case

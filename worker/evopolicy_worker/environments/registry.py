@@ -20,9 +20,9 @@ from evopolicy_common.errors import ConfigError, WorkerError
 from evopolicy_common.messages.environment import Case, EnvironmentDescription
 from evopolicy_worker.environments.families import foreign
 from evopolicy_worker.environments.interface import settings
-from evopolicy_worker.environments.interface.adapters import versions
 from evopolicy_worker.environments.interface.base import Environment
 from evopolicy_worker.environments.interface.calls import traced
+from evopolicy_worker.environments.interface.fingerprint import versions
 from evopolicy_worker.environments.interface.gymnasium_adapter import (
     GymnasiumEnvironment,
     GymnasiumFamily,
@@ -65,7 +65,8 @@ def make(env_id: str, *, render: bool = False, accelerations: bool | None = None
     if entry.adapter == "toy":
         from evopolicy_worker.environments.families import toy
 
-        return toy.make(entry, render=render)
+        kind = toy.Line if entry.id == "toy/line" else toy.Maze
+        return kind(entry, render=render)
     family = family_of(entry)
     if not family.installed():
         raise WorkerError(f"{env_id} needs {family.needs()}")

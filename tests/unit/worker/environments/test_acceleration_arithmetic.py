@@ -12,7 +12,7 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from evopolicy_worker.environments.accelerations.highway_arithmetic import clip, not_zero, wrap
+from evopolicy_worker.environments.accelerations.highway_shared import clip, not_zero, wrap
 
 highway_env = pytest.importorskip("highway_env")
 

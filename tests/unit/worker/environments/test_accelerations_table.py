@@ -12,8 +12,9 @@ from minigrid.core.world_object import Ball, Door, Wall
 
 from evopolicy_common.messages.environment import Case
 from evopolicy_worker.environments import make, process_environment
-from evopolicy_worker.environments.accelerations import ACCELERATIONS, PROVED, table, usable
+from evopolicy_worker.environments.accelerations import ACCELERATIONS, table
 from evopolicy_worker.environments.accelerations.minigrid_view import _row
+from evopolicy_worker.environments.accelerations.table import PROVED, usable
 from evopolicy_worker.environments.interface.gymnasium_adapter import GymnasiumEnvironment
 
 MAZE = "gymnasium/MiniGrid-FourRooms-v0"

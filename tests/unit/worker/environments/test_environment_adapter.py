@@ -16,7 +16,7 @@ from evopolicy_common.errors import ConfigError, WorkerError
 from evopolicy_common.messages.environment import Case
 from evopolicy_worker.environments import describe, make, registry
 from evopolicy_worker.environments.families import box2d
-from evopolicy_worker.environments.interface import adapters, gymnasium_adapter
+from evopolicy_worker.environments.interface import fingerprint, gymnasium_adapter
 from evopolicy_worker.environments.interface.gymnasium_adapter import GymnasiumEnvironment, GymnasiumFamily
 
 
@@ -211,7 +211,7 @@ def test_only_what_plays_an_environment_is_in_its_adapters_digest(monkeypatch: p
         return original(path)
 
     monkeypatch.setattr(Path, "read_bytes", noted)
-    adapters._digest.cache_clear()
-    adapters.adapter(type(box2d.FAMILY), 1, "CarRacing-v3")
+    fingerprint._digest.cache_clear()
+    fingerprint.adapter(type(box2d.FAMILY), 1, "CarRacing-v3")
     assert {"box2d.py", "loop.py", "player.py", "car_racing_road.py", "gymnasium_adapter.py"} <= set(read)
     assert not {"mujoco.py", "registry.py", "highway_lanes.py", "table.py"} & set(read)

@@ -16,13 +16,6 @@ They are on by default; `make(env_id, accelerations=False)` or `EVOPOLICY_ACCELE
 
 from __future__ import annotations
 
-from evopolicy_worker.environments.accelerations.table import (
-    ACCELERATIONS,
-    PROVED,
-    Acceleration,
-    accelerate,
-    off,
-    usable,
-)
-
-__all__ = ["ACCELERATIONS", "PROVED", "Acceleration", "accelerate", "off", "usable"]
+from evopolicy_worker.environments.accelerations.table import ACCELERATIONS as ACCELERATIONS
+from evopolicy_worker.environments.accelerations.table import accelerate as accelerate
+from evopolicy_worker.environments.accelerations.table import off as off

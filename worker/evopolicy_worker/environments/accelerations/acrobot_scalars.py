@@ -121,7 +121,6 @@ def holds() -> bool:
 
 
 def accelerate(env: Any) -> None:
-    """Compute the steps of this bare Acrobot with plain numbers."""
     specialise(env, ScalarAcrobot)
     env._angles = np.empty(3)
     env._slope = _slope_of(env, env._angles)

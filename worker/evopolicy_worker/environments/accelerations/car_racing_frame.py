@@ -132,5 +132,4 @@ def holds() -> bool:
 
 
 def accelerate(env: Any) -> None:
-    """Draw the observations of this bare CarRacing environment faster."""
     specialise(env, NarrowFrames)

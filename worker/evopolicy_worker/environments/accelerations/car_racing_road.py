@@ -69,8 +69,7 @@ class _Polygons:
         x = self._x * cos - self._y * sin + (translation[0] - WINDOW_W / 2)
         y = self._x * sin + self._y * cos + (translation[1] - PANEL_ROWS - ROAD_ROWS / 2)
         inside = (np.abs(x) < reach + WINDOW_W / 2) & (np.abs(y) < reach + ROAD_ROWS / 2)
-        indices: list[int] = np.flatnonzero(inside).tolist()
-        return indices
+        return np.flatnonzero(inside).tolist()
 
 
 _GRASS = _Polygons(
@@ -137,5 +136,4 @@ def _draw(
 
 
 def accelerate(env: Any) -> None:
-    """Draw the road of this bare CarRacing environment faster."""
     specialise(env, VisibleRoad)

@@ -13,19 +13,16 @@ from __future__ import annotations
 
 import math
 from functools import lru_cache
-from typing import Any
+from typing import Any, cast
 
 from highway_env.road.lane import CircularLane, SineLane, StraightLane
 from highway_env.road.road import RoadNetwork
 
-from evopolicy_worker.environments.accelerations.highway_arithmetic import PI, TWO_PI, wrap
-from evopolicy_worker.environments.accelerations.highway_scene import prepare
+from evopolicy_worker.environments.accelerations.highway_shared import DOUBT, PI, TWO_PI, prepare, wrap
 from evopolicy_worker.environments.accelerations.specialise import specialise
 
 CELL = 2.0
 """Side of a cell, metres."""
-DOUBT = 1e-6
-"""Metres; far more than the error of an estimate."""
 _MAX_CELLS = 4_000
 """Some 3 KiB each; more than the cells along the roads of roundabout, or in the car park."""
 _FEW = 6
@@ -76,8 +73,6 @@ class _Straight:
 
 
 class _Circular:
-    """A circular lane."""
-
     def __init__(self, centre: Pair, radius: float, start: float, length: float, direction: float) -> None:
         self._x, self._y = centre
         self._radius, self._start, self._length, self._direction = radius, start, length, direction
@@ -144,10 +139,8 @@ class _Map:
         return cell
 
 
-@lru_cache(maxsize=8)
-def _map(shapes: tuple[Shape, ...]) -> _Map:
-    """Networks of the same lanes, one for every episode, share what was worked out about the plane."""
-    return _Map(shapes)
+_map = lru_cache(maxsize=8)(_Map)
+"""Networks of the same lanes, one for every episode, share what was worked out about the plane."""
 
 
 class MappedNetwork(RoadNetwork):  # type: ignore[misc]
@@ -162,8 +155,7 @@ class MappedNetwork(RoadNetwork):  # type: ignore[misc]
             closest = self._map.closest(x, y, float(heading))
             if closest is not None:
                 return self._indexes[closest]
-        index: Index = super().get_closest_lane_index(position, heading)
-        return index
+        return cast(Index, super().get_closest_lane_index(position, heading))
 
 
 def _map_network(env: Any) -> None:
@@ -192,5 +184,4 @@ def _floats(values: Any) -> tuple[float, ...]:
 
 
 def accelerate(env: Any) -> None:
-    """Map the roads of this bare highway-env environment."""
     prepare(env, _map_network)

@@ -3,8 +3,7 @@
 Replaces the second half of `Road.step`, which checks every vehicle against every other and every object with
 `RoadObject.handle_collisions`. That does nothing when the two are further apart than their diagonals allow, nor when
 some side of one of the rectangles separates both of them, with the way they move in one step. Either is estimated in
-scalars, with an error below 1e-9 m; a pair that is not apart by DOUBT goes to the library, except for a goal that was
-driven over before: it is not solid, and nothing is left to be noted of it.
+scalars, with an error below 1e-9 m; a pair that is not apart by DOUBT goes to the library.
 """
 
 from __future__ import annotations
@@ -15,11 +14,8 @@ from typing import Any
 from highway_env.road.regulation import RegulatedRoad
 from highway_env.road.road import Road
 
-from evopolicy_worker.environments.accelerations.highway_scene import prepare
+from evopolicy_worker.environments.accelerations.highway_shared import DOUBT, prepare
 from evopolicy_worker.environments.accelerations.specialise import specialise
-
-DOUBT = 1e-6
-"""Metres."""
 
 Body = tuple[float, float, float, float, float, float, float, float]
 """x, y, cosine and sine of the heading, half length, half width, diagonal, way in one step."""
@@ -46,7 +42,7 @@ class SiftedRoad(Road):  # type: ignore[misc]
                 reach = (diagonal + other[6]) / 2 + way + DOUBT
                 if reach < 0 or (x - other[0]) ** 2 + (y - other[1]) ** 2 > reach * reach:
                     continue
-                if not _apart(body, other) and not _settled(vehicle, thing):
+                if not _apart(body, other):
                     vehicle.handle_collisions(thing, dt)
 
 
@@ -56,11 +52,6 @@ def _body(thing: Any, dt: float) -> Body:
         *(float(position[0]), float(position[1]), math.cos(heading), math.sin(heading)),
         *(thing.LENGTH / 2, thing.WIDTH / 2, float(thing.diagonal), float(thing.speed) * dt),
     )
-
-
-def _settled(vehicle: Any, thing: Any) -> bool:
-    """Whether all that a collision of the two could do is to mark as hit what is marked already: a goal driven over."""
-    return bool(vehicle.solid and not thing.solid and thing.hit)
 
 
 def _apart(a: Body, b: Body) -> bool:
@@ -92,5 +83,4 @@ def _apart(a: Body, b: Body) -> bool:
 
 
 def accelerate(env: Any) -> None:
-    """Check fewer collisions in this bare highway-env environment."""
     prepare(env, lambda env: specialise(env.road, SiftedRoad))

@@ -3,7 +3,7 @@
 Replaces `local_coordinates`, `heading_at` and `on_lane` of straight, sine and circular lanes. A lane is asked
 by every vehicle about every other, so the same few positions come again and again: the last ones are
 remembered, by value. The arithmetic is the library's in its order, one number at a time (see
-`highway_arithmetic`); of a straight lane only where it runs along an axis, so that each product of its dot
+`highway_shared`); of a straight lane only where it runs along an axis, so that each product of its dot
 products is exact and fusing changes nothing. Other straight lanes remember what the library's method gives.
 """
 
@@ -16,8 +16,7 @@ import numpy as np
 from highway_env.envs.racetrack_env import RacetrackEnv
 from highway_env.road.lane import AbstractLane, CircularLane, SineLane, StraightLane
 
-from evopolicy_worker.environments.accelerations.highway_arithmetic import PI, wrap
-from evopolicy_worker.environments.accelerations.highway_scene import prepare
+from evopolicy_worker.environments.accelerations.highway_shared import PI, prepare, wrap
 from evopolicy_worker.environments.accelerations.specialise import specialise
 
 _REMEMBERED = 256
@@ -56,16 +55,12 @@ class Remembering(AbstractLane):  # type: ignore[misc]
         if not abs(lateral) <= self.width_at(longitudinal) / 2 + margin:
             # Rewards add it up: numpy's truth values and Python's make other numbers of a float32.
             return cast(bool, np.False_)
-        within: bool = -self.VEHICLE_LENGTH <= longitudinal < self.length + self.VEHICLE_LENGTH
-        return within
+        return cast(bool, -self.VEHICLE_LENGTH <= longitudinal < self.length + self.VEHICLE_LENGTH)
 
 
 class AskewLane(Remembering, StraightLane):  # type: ignore[misc]
-    """A straight lane in any direction."""
-
     def _compute(self, position: Any, x: float, y: float) -> Coordinates:
-        coordinates: Coordinates = StraightLane.local_coordinates(self, position)
-        return coordinates
+        return cast(Coordinates, StraightLane.local_coordinates(self, position))
 
 
 class AxisLane(Remembering, StraightLane):  # type: ignore[misc]
@@ -81,8 +76,6 @@ class AxisLane(Remembering, StraightLane):  # type: ignore[misc]
 
 
 class AxisSineLane(AxisLane, SineLane):  # type: ignore[misc]
-    """A sine lane along an axis."""
-
     def _compute(self, position: Any, x: float, y: float) -> Coordinates:
         longitudinal, lateral = AxisLane._compute(self, position, x, y)
         wave = float(np.sin(self.pulsation * longitudinal + self.phase))
@@ -94,8 +87,6 @@ class AxisSineLane(AxisLane, SineLane):  # type: ignore[misc]
 
 
 class ScalarCircularLane(Remembering, CircularLane):  # type: ignore[misc]
-    """A circular lane."""
-
     _start: float
 
     def _compute(self, position: Any, x: float, y: float) -> Coordinates:
@@ -139,7 +130,6 @@ def _on_axis(direction: Any) -> bool:
 
 
 def accelerate(env: Any) -> None:
-    """Quicken the lanes of this bare highway-env environment."""
     prepare(env, _quicken_all)
 
 

@@ -33,7 +33,7 @@ from highway_env.road.lane import CircularLane, SineLane, StraightLane
 from highway_env.vehicle.kinematics import Vehicle
 from highway_env.vehicle.objects import Landmark
 
-from evopolicy_worker.environments.accelerations.highway_arithmetic import not_zero
+from evopolicy_worker.environments.accelerations.highway_shared import not_zero
 from evopolicy_worker.environments.accelerations.specialise import specialise
 
 _GOAL_FEATURES = ["x", "y", "vx", "vy", "cos_h", "sin_h"]
@@ -59,9 +59,8 @@ class GoalInScalars(KinematicsGoalObservation):  # type: ignore[misc]
         if state != self._seen:
             cos, sin = np.cos(vehicle.heading), np.sin(vehicle.heading)
             speed = vehicle.speed
-            own = np.array((position[0], position[1], speed * cos, speed * sin, cos, sin))
-            there = goal.position
-            aim = np.array((there[0], there[1], 0.0, 0.0, np.cos(goal.heading), np.sin(goal.heading)))
+            own = np.array((*position, speed * cos, speed * sin, cos, sin))
+            aim = np.array((*goal.position, 0.0, 0.0, np.cos(goal.heading), np.sin(goal.heading)))
             self._observation = OrderedDict(
                 observation=own / self.scales, achieved_goal=own / self.scales, desired_goal=aim / self.scales
             )
@@ -75,23 +74,20 @@ def _row(thing: Any, features: list[str], origin: Any, intentions: bool) -> list
         known = thing.to_dict(origin, intentions)
         return [known.get(feature, np.nan) for feature in features]
     cos, sin = np.cos(thing.heading), np.sin(thing.heading)
-    known = {
-        "presence": 1.0,
+    known = {"presence": 1.0, "heading": thing.heading, "cos_h": cos, "sin_h": sin}
+    known |= {
         "x": thing.position[0],
         "y": thing.position[1],
         "vx": thing.speed * cos,
         "vy": thing.speed * sin,
-        "heading": thing.heading,
-        "cos_h": cos,
-        "sin_h": sin,
     }
     if "cos_d" in features or "sin_d" in features:
         known["cos_d"], known["sin_d"] = thing.destination_direction if intentions else (0.0, 0.0)
     if not _OFFSETS.isdisjoint(features):
         known |= zip(("long_off", "lat_off", "ang_off"), thing.lane_offset, strict=True)
     if origin is not None:
-        own = _row(origin, ["x", "y", "vx", "vy"], None, True)
-        for feature, value in zip(("x", "y", "vx", "vy"), own, strict=True):
+        relative = ["x", "y", "vx", "vy"]
+        for feature, value in zip(relative, _row(origin, relative, None, True), strict=True):
             known[feature] -= value
     return [known[feature] for feature in features]
 
@@ -136,9 +132,9 @@ class GridInScalars(OccupancyGridObservation):  # type: ignore[misc]
     """Cells around a vehicle that hold a vehicle, or a road."""
 
     def observe(self) -> Any:
-        if not self.env.road or self.features != _GRID_FEATURES or self.absolute or self.as_image:
-            return super().observe()
-        if self.features_range and not {"presence", "x", "y"}.isdisjoint(self.features_range):
+        usual = self.features == _GRID_FEATURES and not self.absolute and not self.as_image
+        ranges = not {"presence", "x", "y"}.isdisjoint(self.features_range or ())
+        if not self.env.road or not usual or ranges:
             return super().observe()
         self.grid.fill(np.nan)
         observer = self.observer_vehicle
@@ -161,15 +157,14 @@ class GridInScalars(OccupancyGridObservation):  # type: ignore[misc]
         (low_x, high_x), (low_y, high_y) = self.grid_size
         # The grid's corners are no further.
         reach = math.hypot(max(-low_x, high_x), max(-low_y, high_y)) + 1
-        spacing = np.amin(self.grid_step)
+        spacing, (n_rows, n_columns) = np.amin(self.grid_step), self.grid.shape[-2:]
         for lane in self.env.road.network.lanes_list():
             disc = _disc(lane)
             if disc is not None and math.hypot(x - disc[0], y - disc[1]) > disc[2] + reach:
                 continue
             origin, _ = lane.local_coordinates(self.observer_vehicle.position)
-            ways = np.arange(
-                origin - lane_perception_distance, origin + lane_perception_distance, spacing
-            ).clip(0, lane.length)
+            ends = origin - lane_perception_distance, origin + lane_perception_distance
+            ways = np.arange(*ends, spacing).clip(0, lane.length)
             if disc is None:
                 doubtful = np.ones(len(ways), bool)
             else:
@@ -182,9 +177,7 @@ class GridInScalars(OccupancyGridObservation):  # type: ignore[misc]
                     dy = lane.start[1] + ways * lane.direction[1] - y
                 i = (cos * dx + sin * dy - low_x) / self.grid_step[0]
                 j = (cos * dy - sin * dx - low_y) / self.grid_step[1]
-                near = (abs(2 * i - self.grid.shape[-2]) < self.grid.shape[-2] + 1) & (
-                    abs(2 * j - self.grid.shape[-1]) < self.grid.shape[-1] + 1
-                )
+                near = (abs(2 * i - n_rows) < n_rows + 1) & (abs(2 * j - n_columns) < n_columns + 1)
                 i, j, ways = i[near], j[near], ways[near]
                 doubtful = (abs(i - i.round()) < DOUBT) | (abs(j - j.round()) < DOUBT)
                 for row, column in zip(i[~doubtful], j[~doubtful], strict=True):
@@ -222,9 +215,7 @@ def _collisions(env: Any, time_quantization: float, horizon: float, vehicle: Any
         same = len(network.all_side_lanes(other.lane_index)) == n_own
         lanes = [other.lane_index[2]] if same else range(n_lanes)
         for index, speed in enumerate(speeds):
-            if speed == other.speed:
-                continue
-            for ahead, cost in ((0, 1), (-margin, 0.5), (margin, 0.5)):
+            for ahead, cost in ((0, 1), (-margin, 0.5), (margin, 0.5)) if speed != other.speed else ():
                 time = (distance + ahead) / not_zero(speed - projected)
                 if time < 0:
                     continue
@@ -278,7 +269,6 @@ class RememberedReward(ParkingEnv):  # type: ignore[misc]
 
 
 def accelerate(env: Any) -> None:
-    """Observe faster in this bare highway-env environment."""
     specialise(env, ScalarObservations)
     if isinstance(env, ParkingEnv):
         specialise(env, RememberedReward)

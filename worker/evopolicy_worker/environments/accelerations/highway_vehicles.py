@@ -3,7 +3,7 @@
 Replaces `Vehicle.step`; of controlled vehicles also `steering_control` and what `act` does around it; of IDM
 vehicles also `act`, `acceleration` and `desired_gap`. The library makes small arrays and calls numpy's `clip`
 for single numbers. Here the same operations are made in the same order on Python floats; trigonometric
-functions, powers and dot products stay numpy's (see `highway_arithmetic`). Vehicles that appear later are
+functions, powers and dot products stay numpy's (see `highway_shared`). Vehicles that appear later are
 replaced before they act.
 
 Replaces `Road.neighbour_vehicles`, which asks every vehicle for its place on the lane. No vehicle moves while
@@ -30,13 +30,16 @@ from highway_env.vehicle.dynamics import BicycleVehicle
 from highway_env.vehicle.kinematics import Vehicle
 from highway_env.vehicle.objects import Landmark
 
-from evopolicy_worker.environments.accelerations.highway_arithmetic import PI, clip, not_zero, wrap
 from evopolicy_worker.environments.accelerations.highway_lanes import Remembering
-from evopolicy_worker.environments.accelerations.highway_scene import prepare
+from evopolicy_worker.environments.accelerations.highway_shared import (
+    DOUBT,
+    PI,
+    clip,
+    not_zero,
+    prepare,
+    wrap,
+)
 from evopolicy_worker.environments.accelerations.specialise import specialise
-
-DOUBT = 1e-6
-"""Metres."""
 
 
 def _advance(vehicle: Any, dt: float) -> None:
@@ -78,8 +81,6 @@ class ScalarControlled(ControlledVehicle):  # type: ignore[misc]
 
 
 class ScalarIDM(ScalarControlled, IDMVehicle):  # type: ignore[misc]
-    """The traffic."""
-
     def step(self, dt: float) -> None:
         self.timer += dt
         _advance(self, dt)
@@ -263,5 +264,4 @@ def quicken(vehicle: Any) -> None:
 
 
 def accelerate(env: Any) -> None:
-    """Quicken the vehicles of this bare highway-env environment."""
     prepare(env, _make_road_scalar, _quicken_all)

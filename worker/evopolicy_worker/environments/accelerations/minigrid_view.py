@@ -101,5 +101,4 @@ class DirectView(MiniGridEnv):  # type: ignore[misc]
 
 
 def accelerate(env: Any) -> None:
-    """Read the views of this bare MiniGrid environment directly."""
     specialise(env, DirectView)

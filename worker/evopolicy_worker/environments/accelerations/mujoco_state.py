@@ -44,8 +44,6 @@ class _Direct(MujocoEnv):
 
 
 class DirectCheetah(_Direct, HalfCheetahEnv):
-    """HalfCheetah."""
-
     def look_up(self) -> None:
         super().look_up()
         skipped = 1 if self._exclude_current_positions_from_observation else 0
@@ -59,12 +57,7 @@ class DirectCheetah(_Direct, HalfCheetahEnv):
         velocity = (after - before) / self._seconds
         forward = self._forward_reward_weight * velocity
         cost = float(self._ctrl_cost_weight * np.add.reduce(np.square(action)))
-        info = {
-            "x_position": after,
-            "x_velocity": velocity,
-            "reward_forward": forward,
-            "reward_ctrl": -cost,
-        }
+        info = {"x_position": after, "x_velocity": velocity, "reward_forward": forward, "reward_ctrl": -cost}
         return self._get_obs(), forward - cost, False, False, info
 
     def _get_obs(self) -> Any:
@@ -72,8 +65,6 @@ class DirectCheetah(_Direct, HalfCheetahEnv):
 
 
 class DirectReacher(_Direct, ReacherEnv):
-    """Reacher."""
-
     def look_up(self) -> None:
         super().look_up()
         self._fingertip, self._target = self.position("fingertip"), self.position("target")
@@ -97,8 +88,6 @@ class DirectReacher(_Direct, ReacherEnv):
 
 
 class DirectPusher(_Direct, PusherEnv):
-    """Pusher."""
-
     def look_up(self) -> None:
         super().look_up()
         self._tips, self._object, self._goal = map(self.position, ("tips_arm", "object", "goal"))
@@ -121,6 +110,5 @@ _CLASSES = {HalfCheetahEnv: DirectCheetah, ReacherEnv: DirectReacher, PusherEnv:
 
 
 def accelerate(env: Any) -> None:
-    """Have this bare environment read its state through views."""
     specialise(env, _CLASSES[type(env)])
     env.look_up()

@@ -18,7 +18,7 @@ from gymnasium import spaces
 from evopolicy_worker.environments.browser import keys
 from evopolicy_worker.environments.browser.browsergym_calls import calls
 from evopolicy_worker.environments.browser.page import CLICK, DOUBLE_CLICK, ORIGIN
-from evopolicy_worker.environments.browser.page_env import PageEnv, script
+from evopolicy_worker.environments.browser.page_env import PageEnv, Stepped, script
 
 MAX_ACTION = 4096
 """Characters of an action."""
@@ -56,7 +56,7 @@ class BrowserGymEnv(PageEnv):
         self._over, self._held, self._last = False, 0, ("", "")
         return self._observation(report)
 
-    def _step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+    def _step(self, action: Any) -> Stepped:
         error = ""
         self._over = False
         try:

@@ -22,7 +22,7 @@ import signal
 import socket
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -55,57 +55,31 @@ _POLL_S = 0.005
 _FOLDER = 5
 """The browser's descriptor of its profile."""
 
+_DRAWING = """
+    --disable-gpu --disable-software-rasterizer --in-process-gpu --disable-gpu-vsync --disable-frame-rate-limit
+    --disable-lcd-text --disable-partial-raster --disable-smooth-scrolling --font-render-hinting=none
+    --force-color-profile=srgb --force-device-scale-factor=1 --window-size=500,320
+"""
+"""On the processor, without waiting for a screen, the same pixels everywhere."""
+_ALONE = """
+    --force-webrtc-ip-handling-policy=disable_non_proxied_udp --disable-quic --block-new-web-contents
+    --disable-background-networking --disable-background-timer-throttling --disable-backgrounding-occluded-windows
+    --disable-renderer-backgrounding --disable-breakpad --disable-crash-reporter
+    --disable-client-side-phishing-detection --disable-component-update
+    --disable-component-extensions-with-background-pages --disable-default-apps --disable-domain-reliability
+    --disable-extensions --disable-hang-monitor --disable-ipc-flooding-protection
+    --disable-search-engine-choice-screen --disable-sync --metrics-recording-only --mute-audio
+    --no-default-browser-check --no-first-run --no-pings --no-service-autorun --password-store=basic
+    --use-mock-keychain
+"""
+"""No network, no other windows, nothing in the background."""
 _FLAGS = (
-    "--headless",
-    "--no-sandbox",
-    "--no-zygote",
-    "--remote-debugging-pipe",
-    # Drawing: on the processor, without waiting for a screen, the same pixels everywhere.
-    "--disable-gpu",
-    "--disable-software-rasterizer",
-    "--in-process-gpu",
-    "--disable-gpu-vsync",
-    "--disable-frame-rate-limit",
-    "--disable-lcd-text",
-    "--disable-partial-raster",
-    "--disable-smooth-scrolling",
-    "--font-render-hinting=none",
-    "--force-color-profile=srgb",
-    "--force-device-scale-factor=1",
-    "--window-size=500,320",
-    # No network, no other windows, nothing in the background.
+    *("--headless", "--no-sandbox", "--no-zygote", "--remote-debugging-pipe"),
+    *_DRAWING.split(),
     "--host-resolver-rules=MAP * ~NOTFOUND",
-    "--force-webrtc-ip-handling-policy=disable_non_proxied_udp",
-    "--disable-quic",
-    "--block-new-web-contents",
-    "--disable-background-networking",
-    "--disable-background-timer-throttling",
-    "--disable-backgrounding-occluded-windows",
-    "--disable-renderer-backgrounding",
-    "--disable-breakpad",
-    "--disable-crash-reporter",
-    "--disable-client-side-phishing-detection",
-    "--disable-component-update",
-    "--disable-component-extensions-with-background-pages",
-    "--disable-default-apps",
-    "--disable-domain-reliability",
-    "--disable-extensions",
-    "--disable-hang-monitor",
-    "--disable-ipc-flooding-protection",
-    "--disable-search-engine-choice-screen",
-    "--disable-sync",
-    "--metrics-recording-only",
-    "--mute-audio",
-    "--no-default-browser-check",
-    "--no-first-run",
-    "--no-pings",
-    "--no-service-autorun",
-    "--password-store=basic",
-    "--use-mock-keychain",
+    *_ALONE.split(),
     # Memory: few processes, no cache.
-    "--disable-site-isolation-trials",
-    "--renderer-process-limit=1",
-    "--disk-cache-size=1",
+    *("--disable-site-isolation-trials", "--renderer-process-limit=1", "--disk-cache-size=1"),
     "--media-cache-size=1",
     "--enable-blink-features=ComputedAccessibilityInfo",
     # DeferRendererTasksAfterInput: after a click or a key, scripts would wait for the next of 60 frames a second.
@@ -152,9 +126,9 @@ class Chromium:
         _check_sockets()
         self.profile = Path(tempfile.mkdtemp(prefix="browser-"))
         folder = _high(os.open(self.profile, os.O_PATH | os.O_DIRECTORY))
-        theirs_in, self._ours_out = _high_pipe()
-        self._ours_in, theirs_out = _high_pipe()
-        self.devtools = DevTools(self._ours_out, self._ours_in, on_event)
+        theirs_in, ours_out = map(_high, os.pipe())
+        ours_in, theirs_out = map(_high, os.pipe())
+        self.devtools = DevTools(ours_out, ours_in, on_event)
         try:
             self.pid = self._spawn(path, theirs_in, theirs_out, folder)
         except OSError as error:
@@ -180,11 +154,25 @@ class Chromium:
 
     def _spawn(self, path: str, theirs_in: int, theirs_out: int, folder: int) -> int:
         """Starts the program and returns its pid. OSError when it is none."""
-        with _limited_data():
+        variables = {
+            "PATH": "/usr/bin:/bin",
+            "HOME": str(self.profile),
+            # The profile too, by a path short enough for the socket that the browser makes in it.
+            "TMPDIR": f"/proc/self/fd/{_FOLDER}",
+            "XDG_CONFIG_HOME": f"{self.profile}/config",
+            "XDG_CACHE_HOME": f"{self.profile}/cache",
+            "LANG": "C.UTF-8",
+            "TZ": "UTC",
+        }
+        soft, hard = resource.getrlimit(resource.RLIMIT_DATA)
+        limit = _DATA_LIMIT if hard == resource.RLIM_INFINITY else min(_DATA_LIMIT, hard)
+        # Of this process, for its children; restored once the browser has started.
+        resource.setrlimit(resource.RLIMIT_DATA, (limit, hard))
+        try:
             return os.posix_spawn(
                 path,
                 [path, *_FLAGS, f"--user-data-dir={self.profile}", "about:blank"],
-                _variables(self.profile),
+                variables,
                 file_actions=[
                     (os.POSIX_SPAWN_OPEN, 0, os.devnull, os.O_RDONLY, 0),
                     (os.POSIX_SPAWN_OPEN, 1, os.devnull, os.O_WRONLY, 0),
@@ -195,6 +183,8 @@ class Chromium:
                 ],
                 setsid=True,
             )
+        finally:
+            resource.setrlimit(resource.RLIMIT_DATA, (soft, hard))
 
     def megabytes(self) -> int:
         """Resident memory of all its processes together, MiB; what several processes share is divided among them."""
@@ -233,42 +223,11 @@ def _check_sockets() -> None:
         ) from error
 
 
-def _variables(profile: Path) -> dict[str, str]:
-    """All environment variables of the browser."""
-    return {
-        "PATH": "/usr/bin:/bin",
-        "HOME": str(profile),
-        # The profile too, by a path short enough for the socket that the browser makes in it.
-        "TMPDIR": f"/proc/self/fd/{_FOLDER}",
-        "XDG_CONFIG_HOME": f"{profile}/config",
-        "XDG_CACHE_HOME": f"{profile}/cache",
-        "LANG": "C.UTF-8",
-        "TZ": "UTC",
-    }
-
-
-def _high_pipe() -> tuple[int, int]:
-    """A pipe whose descriptors are none of those that the browser's ends become."""
-    reading, writing = map(_high, os.pipe())
-    return reading, writing
-
-
 def _high(descriptor: int) -> int:
-    found = fcntl.fcntl(descriptor, fcntl.F_DUPFD_CLOEXEC, _FOLDER + 1)
+    """The descriptor's file under another one, which is none of those that the browser gets."""
+    moved = fcntl.fcntl(descriptor, fcntl.F_DUPFD_CLOEXEC, _FOLDER + 1)
     os.close(descriptor)
-    return found
-
-
-@contextlib.contextmanager
-def _limited_data() -> Iterator[None]:
-    """Processes started inside may not have more writable memory than `_DATA_LIMIT`."""
-    soft, hard = resource.getrlimit(resource.RLIMIT_DATA)
-    limit = _DATA_LIMIT if hard == resource.RLIM_INFINITY else min(_DATA_LIMIT, hard)
-    resource.setrlimit(resource.RLIMIT_DATA, (limit, hard))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_DATA, (soft, hard))
+    return moved
 
 
 def _session(leader: int) -> list[int]:

@@ -43,13 +43,10 @@ class DevTools:
         self, commands: int, replies: int, on_event: Callable[[str, dict[str, Any], str], None]
     ) -> None:
         """`commands`, `answers`: descriptors to write to and to read from, owned by this object."""
-        self._commands = commands
-        self._replies = replies
-        self._on_event = on_event
+        self._commands, self._replies, self._on_event = commands, replies, on_event
         self._encode = msgspec.json.Encoder().encode
         self._decode = msgspec.json.Decoder(_Answer).decode
         self._received = bytearray()
-        self._scanned = 0
         self._n = 0
         self._results: dict[int, dict[str, Any]] = {}
         self._wanted: set[int] = set()
@@ -75,10 +72,10 @@ class DevTools:
         deadline = time.monotonic() + timeout_s
         while number not in self._results:
             self._receive(deadline)
-        found = self._results.pop(number)
-        if _ERROR in found:
-            raise BrowserLostError(f"the browser refuses a command: {found[_ERROR]}")
-        return found
+        result = self._results.pop(number)
+        if _ERROR in result:
+            raise BrowserLostError(f"the browser refuses a command: {result[_ERROR]}")
+        return result
 
     def call(self, method: str, session: str = "", *, timeout_s: float, **params: Any) -> dict[str, Any]:
         """Sends a command and waits for its result."""
@@ -103,14 +100,12 @@ class DevTools:
         data = os.read(self._replies, _READ)
         if not data:
             raise BrowserLostError("the browser has ended")
-        self._received += data
-        while (end := self._received.find(0, self._scanned)) >= 0:
-            message = bytes(self._received[:end])
-            del self._received[: end + 1]
-            self._scanned = 0
-            self._take(message)
-        self._scanned = len(self._received)
-        if self._scanned > MAX_MESSAGE_BYTES:
+        *messages, rest = data.split(b"\0")
+        for message in messages:
+            whole, self._received = bytes(self._received) + message, bytearray()
+            self._take(whole)
+        self._received += rest
+        if len(self._received) > MAX_MESSAGE_BYTES:
             raise BrowserLostError(f"the browser sends a message of over {MAX_MESSAGE_BYTES:,} bytes")
 
     def _take(self, message: bytes) -> None:
@@ -122,7 +117,7 @@ class DevTools:
             self._on_event(answer.method, answer.params, answer.session)
         elif answer.id in self._wanted:
             self._wanted.discard(answer.id)
-            failed = answer.error
+            fault = answer.error
             self._results[answer.id] = (
-                answer.result if failed is None else {_ERROR: failed.get("message", failed)}
+                answer.result if fault is None else {_ERROR: fault.get("message", fault)}
             )

@@ -5,7 +5,7 @@ Of the random values of the action spaces hardly one names an element, or is a c
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import msgspec
@@ -17,25 +17,19 @@ from evopolicy_worker.environments.browser.page_env import USUAL
 Rng = np.random.Generator
 Box = tuple[float, float, float, float]
 """Left, top, width, height."""
-_FIELDS, _BOXES = ("textbox", "searchbox", "spinbutton"), ("checkbox", "radio")
 _ROLES = {
-    "fill": _FIELDS,
-    "clear": _FIELDS,
-    "check": _BOXES,
-    "uncheck": _BOXES,
+    **dict.fromkeys(("fill", "clear"), ("textbox", "searchbox", "spinbutton")),
+    **dict.fromkeys(("check", "uncheck"), ("checkbox", "radio")),
     "select_option": ("combobox", "listbox"),
 }
 """Calls that only elements of these roles take."""
 _TEXTS = ("a", "7", "hello", "12/24/2020", "12:30PM", "two words\nand a line", "é中😀")
 _KEYS = ("Enter", "Tab", "Shift+Tab", "Escape", "Backspace", "Delete", "Space", "a", "B", "7", "Home", "Shift+End", "PageDown",  # noqa: E501
          "ArrowUp", "ArrowDown", "ArrowLeft", "Shift+ArrowRight", "Control+a", "Control+c", "Control+v", "Control+x")  # fmt: skip  # noqa: E501
-_MODIFIERS: Sequence[list[str]] = ([], [], [], ["Shift"], ["Control"])
-_TURNS = (0, 50, -50, 300)
-_ENDS = {"x": 0, "y": 1}
 
 
 class _Seen:
-    """What there is in the page that an observation of BrowserGym shows."""
+    """The elements and texts of a page that an observation of BrowserGym shows."""
 
     def __init__(self, obs: Mapping[str, Any]) -> None:
         properties = msgspec.json.decode(obs["extra_element_properties"])
@@ -46,37 +40,33 @@ class _Seen:
         self.bids = {name: usual for name in SIGNATURES if name not in _ROLES}
         """By call, the elements that take it."""
         del self.bids["report_infeasible"]  # It would end the episode.
-        for name, roles in _ROLES.items():
-            if taken := [each["browsergym_id"] for each in nodes if each["role"]["value"] in roles]:
+        roles = [each["role"]["value"] for each in nodes]
+        for name, wanted in _ROLES.items():
+            if taken := [
+                each["browsergym_id"] for each, role in zip(nodes, roles, strict=True) if role in wanted
+            ]:
                 self.bids[name] = taken
         names = [str(each["name"]["value"])[:40] for each in nodes]
         self.texts = [*_TEXTS, *_TEXTS, *names]
-        self.options = [
-            name for name, each in zip(names, nodes, strict=True) if each["role"]["value"] == "option"
-        ] or names
+        self.options = [name for name, role in zip(names, roles, strict=True) if role == "option"] or names
 
 
 def _one(of: Sequence[Any], rng: Rng) -> Any:
     return of[int(rng.integers(len(of)))]
 
 
-_BUTTONS = ("left", "left", "left", "middle", "right")
-_DRAWN: Mapping[str, Callable[[_Seen, str], Sequence[Any]]] = {
-    "bid": lambda seen, name: seen.bids[name],
-    "from_bid": lambda seen, name: seen.bids[name],
-    "to_bid": lambda seen, name: seen.bids[name],
-    "text": lambda seen, name: seen.texts,
-    "value": lambda seen, name: seen.texts,
-    "options": lambda seen, name: seen.options,
-    "key": lambda seen, name: _KEYS,
-    "key_comb": lambda seen, name: _KEYS,
-    "button": lambda seen, name: _BUTTONS,
-    "modifiers": lambda seen, name: _MODIFIERS,
-    "delta_x": lambda seen, name: _TURNS,
-    "delta_y": lambda seen, name: _TURNS,
-    "wait_ms": lambda seen, name: (0, 200, 1000),
-}
-"""By the name of a call's argument, the values of which one is drawn; the other arguments are a place's."""
+def _values(seen: _Seen, name: str) -> Mapping[str, Sequence[Any]]:
+    """By the name of a call's argument, the values of which one is drawn; the other arguments are a place's."""
+    return {
+        **dict.fromkeys(("bid", "from_bid", "to_bid"), seen.bids[name]),
+        **dict.fromkeys(("text", "value"), seen.texts),
+        **dict.fromkeys(("key", "key_comb"), _KEYS),
+        **dict.fromkeys(("delta_x", "delta_y"), (0, 50, -50, 300)),
+        "options": seen.options,
+        "button": ("left", "left", "left", "middle", "right"),
+        "modifiers": ([], [], [], ["Shift"], ["Control"]),
+        "wait_ms": (0, 200, 1000),
+    }
 
 
 def browsergym(obs: Mapping[str, Any], rng: Rng) -> str:
@@ -86,15 +76,15 @@ def browsergym(obs: Mapping[str, Any], rng: Rng) -> str:
 
 
 def _call(name: str, seen: _Seen, rng: Rng) -> str:
-    place = (0.0, 0.0)
+    place, values = (0.0, 0.0), _values(seen, name)
     arguments = []
     for argument in SIGNATURES[name]:
-        if argument in _DRAWN:
-            arguments.append(_one(_DRAWN[argument](seen, name), rng))
+        if argument in values:
+            arguments.append(_one(values[argument], rng))
             continue
         if argument.endswith("x"):
             place = _place(seen.boxes, USUAL[:2], rng)
-        arguments.append(round(place[_ENDS[argument[-1]]], 1))
+        arguments.append(round(place[argument.endswith("y")], 1))
     return f"{name}({', '.join(map(repr, arguments))})"
 
 

@@ -31,17 +31,19 @@ def _named() -> dict[str, Key]:
     moving = ("PageUp", "PageDown", "End", "Home", "ArrowLeft", "ArrowUp", "ArrowRight", "ArrowDown")
     numbers = {"Backspace": 8, "Tab": 9, "Enter": 13, "Escape": 27, "Insert": 45, "Delete": 46}
     numbers |= {name: 33 + k for k, name in enumerate(moving)} | {f"F{k}": 111 + k for k in range(1, 13)}
-    found = {name: Key(name, name, n, "\r" if name == "Enter" else "") for name, n in numbers.items()}
-    found["Space"] = Key(" ", "Space", 32, " ")
-    for name, number in {"Shift": 16, "Control": 17, "Alt": 18, "Meta": 91}.items():
-        found[name] = Key(name, f"{name}Left", number, location=1)
-    pad = {"Multiply": "*", "Add": "+", "Subtract": "-", "Decimal": ".", "Divide": "/"}
-    numbers = {"Multiply": 106, "Add": 107, "Subtract": 109, "Decimal": 110, "Divide": 111}
-    for name, number in {**{str(k): 96 + k for k in range(10)}, **numbers}.items():
-        text = pad.get(name, name)
-        found[f"Numpad{name}"] = Key(text, f"Numpad{name}", number, text, location=3)
-    found["NumpadEnter"] = Key("Enter", "NumpadEnter", 13, "\r", location=3)
-    return found
+    signs = {"Multiply": ("*", 106), "Add": ("+", 107), "Subtract": ("-", 109)}
+    signs |= {"Decimal": (".", 110), "Divide": ("/", 111)} | {str(k): (str(k), 96 + k) for k in range(10)}
+    modifiers = {"Shift": 16, "Control": 17, "Alt": 18, "Meta": 91}
+    return {
+        **{name: Key(name, name, n, "\r" if name == "Enter" else "") for name, n in numbers.items()},
+        "Space": Key(" ", "Space", 32, " "),
+        **{name: Key(name, f"{name}Left", n, location=1) for name, n in modifiers.items()},
+        **{
+            f"Numpad{name}": Key(text, f"Numpad{name}", n, text, location=3)
+            for name, (text, n) in signs.items()
+        },
+        "NumpadEnter": Key("Enter", "NumpadEnter", 13, "\r", location=3),
+    }
 
 
 def _printable() -> dict[str, Key]:
@@ -56,26 +58,23 @@ def _printable() -> dict[str, Key]:
         *(("'", '"', "Quote", 222), ("`", "~", "Backquote", 192), (",", "<", "Comma", 188)),
         *((".", ">", "Period", 190), ("/", "?", "Slash", 191)),
     ]
-    found = {" ": Key(" ", "Space", 32, " ")}
+    keys = {" ": Key(" ", "Space", 32, " ")}
     for plain, shifted, code, number in pairs:
-        found[plain] = Key(plain, code, number, plain)
-        found[shifted] = Key(shifted, code, number, shifted, shift=True)
-    return found
+        keys[plain] = Key(plain, code, number, plain)
+        keys[shifted] = Key(shifted, code, number, shifted, shift=True)
+    return keys
 
 
 NAMED = _named()
 """Keys that type no character of their own, by `KeyboardEvent.code`."""
 PRINTABLE = _printable()
 """Keys by the character that they type."""
+MODIFIERS = {"Alt": ALT, "Control": CONTROL, "Meta": META, "Shift": SHIFT}
 _BY_CODE = {key.code: key for key in PRINTABLE.values() if not key.shift} | {
     "ControlOrMeta": NAMED["Control"],
-    "ShiftLeft": NAMED["Shift"],
-    "ControlLeft": NAMED["Control"],
-    "AltLeft": NAMED["Alt"],
-    "MetaLeft": NAMED["Meta"],
+    **{f"{name}Left": NAMED[name] for name in MODIFIERS},
 }
 _SHIFTED = {key.code: key for key in PRINTABLE.values() if key.shift}
-MODIFIERS = {"Alt": ALT, "Control": CONTROL, "Meta": META, "Shift": SHIFT}
 
 
 def typed(character: str) -> Key:
@@ -89,12 +88,7 @@ def typed(character: str) -> Key:
 
 def named(name: str) -> Key | None:
     """A key by its name (`Enter`, `KeyA`, `ArrowDown`), or by the character that it types. None for an unknown one."""
-    return (
-        NAMED.get(name)
-        or _BY_CODE.get(name)
-        or PRINTABLE.get(name)
-        or (typed(name) if len(name) == 1 else None)
-    )
+    return NAMED.get(name) or _BY_CODE.get(name) or (typed(name) if len(name) == 1 else None)
 
 
 def miniwob(name: str) -> tuple[Key, int] | None:

@@ -14,7 +14,7 @@ from gymnasium import spaces
 
 from evopolicy_worker.environments.browser import keys, miniwob_pages
 from evopolicy_worker.environments.browser.page import CLICK, DOUBLE_CLICK
-from evopolicy_worker.environments.browser.page_env import PageEnv
+from evopolicy_worker.environments.browser.page_env import PageEnv, Stepped
 
 MAX_TEXT = 256
 MAX_FIELD = 64
@@ -24,20 +24,9 @@ MAX_FIELDS = 20
 SCROLL = 50
 """Pixels that a step of the wheel scrolls."""
 ACTIONS = (
-    "NONE",
-    "MOVE_COORDS",
-    "CLICK_COORDS",
-    "DBLCLICK_COORDS",
-    "MOUSEDOWN_COORDS",
-    "MOUSEUP_COORDS",
-    "SCROLL_UP_COORDS",
-    "SCROLL_DOWN_COORDS",
-    "CLICK_ELEMENT",
-    "PRESS_KEY",
-    "TYPE_TEXT",
-    "TYPE_FIELD",
-    "FOCUS_ELEMENT_AND_TYPE_TEXT",
-    "FOCUS_ELEMENT_AND_TYPE_FIELD",
+    *("NONE", "MOVE_COORDS", "CLICK_COORDS", "DBLCLICK_COORDS", "MOUSEDOWN_COORDS", "MOUSEUP_COORDS"),
+    *("SCROLL_UP_COORDS", "SCROLL_DOWN_COORDS", "CLICK_ELEMENT", "PRESS_KEY", "TYPE_TEXT", "TYPE_FIELD"),
+    *("FOCUS_ELEMENT_AND_TYPE_TEXT", "FOCUS_ELEMENT_AND_TYPE_FIELD"),
 )
 KEYS = (
     *(f"<{name}>" for name in ("Enter", "PageUp", "PageDown", "Backspace", "Delete", "Tab", "Space")),
@@ -46,10 +35,7 @@ KEYS = (
     *(f"<Numpad{k}>" for k in range(10)),
     *(f"<Numpad{name}>" for name in ("Add", "Multiply", "Subtract", "Divide", "Decimal", "Enter")),
     *"abcdefghijklmnopqrstuvwxyz",
-    "C-a",
-    "C-c",
-    "C-x",
-    "C-v",
+    *("C-a", "C-c", "C-x", "C-v"),
     *"ABCDEFGHIJKLMNOPQRSTUVWXYZ",
 )
 """The keys that `key` of an action indexes."""
@@ -70,14 +56,12 @@ class MiniWoBEnv(PageEnv):
     def __init__(self, page: str, **options: Any) -> None:
         """`options`: those of `PageEnv`."""
         super().__init__(page, **{"reward": "decayed", **options})
-        width, height = self.task_size
+        width, height = self._size[2:]
         self.observation_space = spaces.Dict(_observed(width, height, screenshot=self._screenshot))
         self.action_space = spaces.Dict(
             {
                 "action_type": spaces.Discrete(len(ACTIONS)),
-                "coords": spaces.Box(
-                    np.zeros(2, dtype=np.float32), np.array([width, height], dtype=np.float32)
-                ),
+                "coords": spaces.Box(np.zeros(2, np.float32), np.array([width, height], np.float32)),
                 "ref": spaces.Discrete(MAX_REF),
                 "key": spaces.Discrete(len(KEYS)),
                 "text": spaces.Text(MAX_TYPED, min_length=0),
@@ -86,20 +70,20 @@ class MiniWoBEnv(PageEnv):
         )
         self._fields: miniwob_pages.Fields = ()
 
-    def _first(self, found: dict[str, Any]) -> Any:
-        fields = found["fields"]
+    def _first(self, report: dict[str, Any]) -> Any:
+        fields = report["fields"]
         self._fields = (
-            miniwob_pages.fields(self.name, found["utterance"])
+            miniwob_pages.fields(self.name, report["utterance"])
             if fields is None
             else tuple((str(key), str(value)) for key, value in fields)
         )
-        return self._observation(found)
+        return self._observation(report)
 
-    def _step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+    def _step(self, action: Any) -> Stepped:
         self._act(action)
-        outcome = self._pass()
-        reward, done, info = self._scored(outcome)
-        return self._observation({} if done else outcome), reward, done, False, info
+        report = self._pass()
+        reward, done, info = self._scored(report)
+        return self._observation({} if done else report), reward, done, False, info
 
     def _act(self, action: dict[str, Any]) -> None:
         kind = ACTIONS[action["action_type"]]
@@ -119,47 +103,34 @@ class MiniWoBEnv(PageEnv):
             field = action["field"]
             page.type(self._fields[field][1] if field < len(self._fields) else "")
 
-    def _observation(self, found: dict[str, Any]) -> dict[str, Any]:
+    def _observation(self, report: dict[str, Any]) -> dict[str, Any]:
         """The observation; empty after the end of an episode, as in MiniWoB++."""
         observed: dict[str, Any] = {
-            "utterance": found.get("utterance", ""),
-            "dom_elements": tuple(map(_element, found.get("elements", ()))),
-            "fields": self._fields[:MAX_FIELDS] if found else (),
+            "utterance": report.get("utterance", ""),
+            "dom_elements": tuple(map(_element, report.get("elements", ()))),
+            "fields": self._fields[:MAX_FIELDS] if report else (),
         }
         if self._screenshot:
-            width, height = self.task_size
-            observed["screenshot"] = (
-                self.picture(width, height) if found else np.zeros((height, width, 3), np.uint8)
-            )
+            width, height = self._size[2:]
+            empty = np.zeros((height, width, 3), np.uint8)
+            observed["screenshot"] = self.picture(width, height) if report else empty
         return observed
 
 
 def _observed(width: int, height: int, *, screenshot: bool) -> dict[str, Any]:
-    text = spaces.Text(MAX_TEXT, min_length=0)
-    name = spaces.Text(MAX_FIELD, min_length=0)
-    anywhere, length = spaces.Box(-np.inf, np.inf, (1,)), spaces.Box(0.0, np.inf, (1,))
-    colour = spaces.Box(0.0, 255.0, (4,))
-    element = spaces.Dict(
-        {
-            "ref": spaces.Discrete(2 * MAX_REF, start=-MAX_REF),
-            "parent": spaces.Discrete(MAX_REF),
-            "left": anywhere,
-            "top": anywhere,
-            "width": length,
-            "height": length,
-            "tag": text,
-            "text": text,
-            "value": text,
-            "id": text,
-            "classes": text,
-            "bg_color": colour,
-            "fg_color": colour,
-            "flags": spaces.MultiBinary(4),
-        }
-    )
+    text, name = spaces.Text(MAX_TEXT, min_length=0), spaces.Text(MAX_FIELD, min_length=0)
+    element = {
+        "ref": spaces.Discrete(2 * MAX_REF, start=-MAX_REF),
+        "parent": spaces.Discrete(MAX_REF),
+        **dict.fromkeys(("left", "top"), spaces.Box(-np.inf, np.inf, (1,))),
+        **dict.fromkeys(("width", "height"), spaces.Box(0.0, np.inf, (1,))),
+        **dict.fromkeys(("tag", "text", "value", "id", "classes"), text),
+        **dict.fromkeys(("bg_color", "fg_color"), spaces.Box(0.0, 255.0, (4,))),
+        "flags": spaces.MultiBinary(4),
+    }
     observed: dict[str, Any] = {
         "utterance": text,
-        "dom_elements": spaces.Sequence(element),
+        "dom_elements": spaces.Sequence(spaces.Dict(element)),
         "fields": spaces.Sequence(spaces.Tuple((name, name))),
     }
     if screenshot:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import ast
 import importlib.util
-import inspect
+import re
 from collections.abc import Callable, Sequence
 from functools import cache
 from importlib.util import find_spec
@@ -38,25 +38,21 @@ def folder() -> Path:
     return Path(spec.submodule_search_locations[0])
 
 
-def root() -> Path:
-    """The folder of its pages."""
-    return folder() / "html"
-
-
 def document(name: str) -> str:
-    """Path of a page's document below `root`, by its name: `click-test`, `flight.AA`."""
+    """Path of a page's document below the folder `html`, by its name: `click-test`, `flight.AA`."""
     return f"{name.replace('.', '/')}/wrapper.html" if name.startswith("flight.") else f"miniwob/{name}.html"
 
 
 @cache
 def texts() -> dict[str, PageText]:
     """The documentation by page name."""
-    found: dict[str, PageText] = {}
-    for path in sorted(folder().glob("envs/*.py")):
-        for node in ast.parse(path.read_text("utf-8")).body:
-            if isinstance(node, ast.ClassDef) and (name := _subdomain(node)):
-                found[name] = _text(inspect.cleandoc(ast.get_docstring(node) or ""))
-    return found
+    nodes = (
+        node
+        for path in sorted(folder().glob("envs/*.py"))
+        for node in ast.parse(path.read_text("utf-8")).body
+        if isinstance(node, ast.ClassDef)
+    )
+    return {name: _text(ast.get_docstring(node) or "") for node in nodes if (name := _subdomain(node))}
 
 
 def _subdomain(node: ast.ClassDef) -> str:
@@ -67,20 +63,15 @@ def _subdomain(node: ast.ClassDef) -> str:
 
 
 def _text(doc: str) -> PageText:
-    parts: dict[str, list[str]] = {}
-    lines: list[str] = []
-    for line in doc.splitlines():
-        if line.startswith("## "):
-            lines = parts.setdefault(line[3:].strip().lower(), [])
-        else:
-            lines.append(line)
-    examples = (
-        line.strip()[2:] for line in parts.get("example utterances", ()) if line.strip().startswith("* ")
-    )
+    sections = re.findall(r"^## *(.*?) *\n(.*?)(?=^## |\Z)", doc, re.MULTILINE | re.DOTALL)
+    parts = {name.lower(): text for name, text in sections}
+    lines = [line.strip() for line in parts.get("example utterances", "").splitlines()]
+    examples = (line[2:] for line in lines if line.startswith("* "))
+    notes = parts.get("additional notes", "").splitlines()
     return PageText(
-        "\n".join(parts.get("description", ())).strip(),
+        parts.get("description", "").strip(),
         tuple(each for each in examples if each != "TODO"),
-        "\n".join(line for line in parts.get("additional notes", ()) if "preprocessor" not in line).strip(),
+        "\n".join(line for line in notes if "preprocessor" not in line).strip(),
     )
 
 

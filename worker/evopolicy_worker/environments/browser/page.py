@@ -369,6 +369,7 @@ class Page:
 
     def _serve(self, params: dict[str, Any], session: str) -> None:
         body = self._body(params["request"]["url"])
+        answer: dict[str, Any]
         if body is None:
             method, answer = "Fetch.failRequest", {"errorReason": _NO_REASON}
         else:
@@ -403,20 +404,19 @@ _BITS: dict[Button, int] = {"left": 1, "right": 2, "middle": 4}
 
 def _first(address: Address) -> list[tuple[str, dict[str, Any]]]:
     """Commands that prepare a target for a page."""
-    return [
+    size = {"width": address.width, "height": address.height, "deviceScaleFactor": 1, "mobile": False}
+    commands: list[tuple[str, dict[str, Any]]] = [
         ("Inspector.enable", {}),
         ("Page.enable", {}),
         ("Fetch.enable", {"patterns": [{"urlPattern": "*"}]}),
         ("Target.setAutoAttach", {"autoAttach": True, "waitForDebuggerOnStart": True, "flatten": True}),
         ("Emulation.setFocusEmulationEnabled", {"enabled": True}),
-        # Keeps the accessibility tree between two questions. Without it, each element's role and name builds a tree
-        # anew.
-        *([("Accessibility.enable", {})] if address.accessible else []),
-        (
-            "Emulation.setDeviceMetricsOverride",
-            {"width": address.width, "height": address.height, "deviceScaleFactor": 1, "mobile": False},
-        ),
+        ("Emulation.setDeviceMetricsOverride", size),
     ]
+    if address.accessible:
+        # Keeps the accessibility tree between two questions: else each element's role and name builds it anew.
+        commands.append(("Accessibility.enable", {}))
+    return commands
 
 
 def _script(seed: str, *, virtual: bool) -> str:

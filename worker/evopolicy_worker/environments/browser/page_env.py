@@ -17,7 +17,7 @@ import io
 import json
 from abc import abstractmethod
 from importlib.resources import files
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import gymnasium
 import numpy as np
@@ -33,11 +33,9 @@ STEP_MS = 200
 Reward = Literal["decayed", "raw", "binary", "positive"]
 """`decayed`: as the page gives it, which is less the later it comes. `raw`: before that. `binary`: 1 for a raw reward
 of 1, -1 for any other end. `positive`: 1 for a raw reward above 0, 0 for any other end."""
-_CHOICES: dict[str, tuple[str, ...]] = {
-    "reward": ("decayed", "raw", "binary", "positive"),
-    "clock": ("steps", "wall"),
-    "load": ("once", "each"),
-}
+Clock = Literal["steps", "wall"]
+Load = Literal["once", "each"]
+Stepped = tuple[Any, float, bool, bool, dict[str, Any]]
 FLIGHT = (600, 700, 375, 667)
 USUAL = (500, 320, 160, 210)
 """Width and height of the window and of the task in its upper left corner, CSS pixels."""
@@ -57,8 +55,8 @@ class PageEnv(gymnasium.Env[Any, Any]):
         page: str,
         *,
         reward: Reward,
-        clock: Literal["steps", "wall"] = "steps",
-        load: Literal["once", "each"] = "once",
+        clock: Clock = "steps",
+        load: Load = "once",
         data_mode: str = "train",
         episode_ms: int = 0,
         screenshot: bool = False,
@@ -74,19 +72,17 @@ class PageEnv(gymnasium.Env[Any, Any]):
         Raises ConfigError for an argument that is none of the choices, and WorkerError when a program or package is
         missing.
         """
-        for name, value in (("reward", reward), ("clock", clock), ("load", load)):
-            if value not in _CHOICES[name]:
-                raise ConfigError(f"{name} is {value!r}: {', '.join(_CHOICES[name])}")
-        self.render_mode = render_mode
-        self.name = page
+        choices = (("reward", reward, Reward), ("clock", clock, Clock), ("load", load, Load))
+        for name, value, choice in choices:
+            if value not in get_args(choice):
+                raise ConfigError(f"{name} is {value!r}: {', '.join(get_args(choice))}")
+        self.render_mode, self.name, self._mode = render_mode, page, data_mode
         self._reward: Reward = reward
         self._fresh = load == "each" or clock == "wall"
-        self._mode = data_mode
-        self._limit_ms = episode_ms
-        self._screenshot = screenshot
+        self._limit_ms, self._screenshot = episode_ms, screenshot
         self._size = FLIGHT if page.startswith("flight.") else USUAL
         self._address = Address(
-            root=miniwob_pages.root(),
+            root=miniwob_pages.folder() / "html",
             path=miniwob_pages.document(page),
             width=self._size[0],
             height=self._size[1],
@@ -101,11 +97,6 @@ class PageEnv(gymnasium.Env[Any, Any]):
     def page(self) -> Page:
         """The page of this process's browser."""
         return shared()
-
-    @property
-    def task_size(self) -> tuple[int, int]:
-        """Width and height of the task, CSS pixels."""
-        return self._size[2:]
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -122,7 +113,7 @@ class PageEnv(gymnasium.Env[Any, Any]):
             self.page.lose()
             return self._begin(*self._begun), {}
 
-    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+    def step(self, action: Any) -> Stepped:
         try:
             outcome = self._step(action)
         except BrowserLostError:
@@ -146,7 +137,7 @@ class PageEnv(gymnasium.Env[Any, Any]):
     def close(self) -> None:
         """The browser stays for other environments of this process; it ends with the process."""
 
-    def _play_again(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+    def _play_again(self, action: Any) -> Stepped:
         self.page.lose()
         self._begin(*self._begun)
         for each in self._actions:
@@ -166,39 +157,37 @@ class PageEnv(gymnasium.Env[Any, Any]):
         begin = f"{self._enter}({seed}, {json.dumps(mode)}, {self._limit_ms}, {STEP_MS})"
         return self._first(page.tell(f"{begin}.then({self._open})"))
 
-    def _scored(self, found: dict[str, Any]) -> tuple[float, bool, dict[str, Any]]:
+    def _scored(self, report: dict[str, Any]) -> tuple[float, bool, dict[str, Any]]:
         """Reward, whether the episode has ended, and `info`, from the page's report."""
-        done, raw = bool(found["done"]), float(found["raw"])
-        if found["left"]:
+        done, raw, reason = bool(report["done"]), float(report["raw"]), report["reason"]
+        decayed = float(report["reward"])
+        if report["left"]:
             # MiniWoB++'s reward at the timeout. The page is loaded anew for the next episode: it may have grown too
             # large.
             self.page.opened = None
-            done, raw, found = True, -1.0, {**found, "reward": -1.0, "reason": found["left"]}
-        reward = {
-            "decayed": float(found["reward"]),
-            "raw": raw,
-            "binary": 1.0 if raw == 1.0 else -1.0,
-            "positive": float(raw > 0),
-        }[self._reward]
-        info: dict[str, Any] = {"elapsed_ms": found["now"]}
-        if done:
-            info |= {"raw_reward": raw, "reason": found["reason"], "success": raw > 0}
-        return reward if done else 0.0, done, info
+            done, raw, decayed, reason = True, -1.0, -1.0, report["left"]
+        info: dict[str, Any] = {"elapsed_ms": report["now"]}
+        if not done:
+            return 0.0, done, info
+        binary, positive = 1.0 if raw == 1.0 else -1.0, float(raw > 0)
+        rewards = {"decayed": decayed, "raw": raw, "binary": binary, "positive": positive}
+        info |= {"raw_reward": raw, "reason": reason, "success": raw > 0}
+        return rewards[self._reward], done, info
 
     def _pass(self) -> dict[str, Any]:
-        """Lets a step's time pass; then what there is to see."""
+        """Lets a step's time pass; the page's report after it."""
         self.page.keys_ms += STEP_MS
-        found: dict[str, Any] = self.page.tell(
+        report: dict[str, Any] = self.page.tell(
             f"__evopolicy.pass({STEP_MS}, {list(self.page.mouse_at)}).then({self._look})"
         )
-        return found
+        return report
 
     @abstractmethod
-    def _first(self, found: dict[str, Any]) -> Any:
-        """The first observation of an episode. `found`: the page's report."""
+    def _first(self, report: dict[str, Any]) -> Any:
+        """The first observation of an episode, from the page's report."""
 
     @abstractmethod
-    def _step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+    def _step(self, action: Any) -> Stepped:
         """One step. Raises BrowserLostError."""
 
 

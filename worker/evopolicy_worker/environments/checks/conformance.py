@@ -111,8 +111,7 @@ def play(env_id: str, steps: int) -> CheckResult:
 def _play(played: CheckResult, steps: int) -> None:
     environment = registry.make(played.env)
     description = environment.description
-    played.limit = description.max_episode_steps
-    played.rebuilt = environment.rebuilds
+    played.limit, played.rebuilt = description.max_episode_steps, environment.rebuilds
     with _no_pickles(played):
         first = digest_of(_checked(played, environment, steps))
     played.digest = first
@@ -177,24 +176,22 @@ def _checked(played: CheckResult, environment: Environment, steps: int) -> Itera
 @contextlib.contextmanager
 def _no_pickles(played: CheckResult) -> Iterator[None]:
     """Notes whether something is pickled meanwhile: that would be code of the environment's in what others read."""
-    kept = {name: getattr(pickle, name) for name in ("dump", "dumps", "load", "loads")}
 
-    def noting(name: str) -> Callable[..., Any]:
+    def noting(name: str, function: Callable[..., Any]) -> Callable[..., Any]:
         def call(*given: Any, **named: Any) -> Any:
             fault = f"an episode needs pickle.{name}"
             if fault not in played.faults:
                 played.faults.append(fault)
-            return kept[name](*given, **named)
+            return function(*given, **named)
 
         return call
 
-    for name in kept:
-        setattr(pickle, name, noting(name))
-    try:
+    with contextlib.ExitStack() as restored:
+        for name in ("dump", "dumps", "load", "loads"):
+            usual = getattr(pickle, name)
+            restored.callback(setattr, pickle, name, usual)
+            setattr(pickle, name, noting(name, usual))
         yield
-    finally:
-        for name, function in kept.items():
-            setattr(pickle, name, function)
 
 
 def _nonsense(environment: Environment) -> None:
@@ -212,10 +209,8 @@ def _numbers(value: Any) -> set[float]:
     """All numbers in a value, except those in large arrays, where a seed could occur by chance."""
     if isinstance(value, np.ndarray):
         return set(np.ravel(value).astype(float).tolist()) if value.size <= 4096 else set()
-    if isinstance(value, dict):
-        return set().union(*map(_numbers, value.values()))
-    if isinstance(value, list | tuple):
-        return set().union(*map(_numbers, value))
+    if isinstance(value, dict | list | tuple):
+        return set().union(*map(_numbers, value.values() if isinstance(value, dict) else value))
     return {float(value)} if isinstance(value, int | float) and abs(value) < 2**53 else set()
 
 
@@ -246,10 +241,12 @@ def _in_child(env_id: str, steps: int) -> CheckResult:
             finally:
                 os._exit(0)
     os.close(writing)
-    data, why, limit = b"", "", _Limit(pid)
+    data, why = b"", ""
     try:
         with os.fdopen(reading, "rb") as answer:
-            while not (why := limit.passed()):
+            for why in _passed_limits(pid):
+                if why:
+                    break
                 if select.select([answer], [], [], _POLL_S)[0]:
                     part = os.read(answer.fileno(), 1 << 16)
                     if not part:
@@ -270,34 +267,27 @@ def _in_child(env_id: str, steps: int) -> CheckResult:
     return CheckResult(env=env_id, faults=[why or f"its process ended with status {status}"])
 
 
-class _Limit:
-    """The limits of a process; see `TIMEOUT_S` and `LONGEST_S`."""
-
-    def __init__(self, pid: int) -> None:
-        self._pid = pid
-        self._used = 0.0
-        self._began = self._worked_at = time.monotonic()
-
-    def passed(self) -> str:
-        """Why the process is to be ended, in words; empty while it may go on."""
-        used, now = _processor_s(self._pid), time.monotonic()
-        if used > self._used + _WORKS_S:
-            self._used, self._worked_at = used, now
-        if self._used > TIMEOUT_S:
-            return f"it was not done within {TIMEOUT_S:g} s of processor time"
-        if now - self._worked_at > TIMEOUT_S:
-            return f"it hangs: it has used no processor time for {TIMEOUT_S:g} s"
-        if now - self._began > LONGEST_S:
-            return (
-                f"it was not done within {LONGEST_S:g} s, of which it computed for {used:.0f} s: it waits, or the"
+def _passed_limits(pid: int) -> Iterator[str]:
+    """Again and again, why a process is to be ended, in words; empty while it may go on. See `TIMEOUT_S` and
+    `LONGEST_S`."""
+    worked_s, began = 0.0, time.monotonic()
+    worked_at = began
+    while True:
+        # Of the process and of those that it has started.
+        used_s, now = sum(each.cpu_s for each in proc.family(pid)), time.monotonic()
+        if used_s > worked_s + _WORKS_S:
+            worked_s, worked_at = used_s, now
+        if worked_s > TIMEOUT_S:
+            yield f"it was not done within {TIMEOUT_S:g} s of processor time"
+        elif now - worked_at > TIMEOUT_S:
+            yield f"it hangs: it has used no processor time for {TIMEOUT_S:g} s"
+        elif now - began > LONGEST_S:
+            yield (
+                f"it was not done within {LONGEST_S:g} s, of which it computed for {used_s:.0f} s: it waits, or the"
                 " machine is too busy; correct the environment, or play it on an idle machine"
             )
-        return ""
-
-
-def _processor_s(pid: int) -> float:
-    """Processor time of a process and of those that it has started, seconds."""
-    return sum(each.cpu_s for each in proc.family(pid))
+        else:
+            yield ""
 
 
 def _kill(pids: list[int]) -> None:

@@ -41,40 +41,31 @@ class Stretch(msgspec.Struct, frozen=True):
     fault: str = ""
 
 
-class _Player:
-    def __init__(self, env_id: str) -> None:
-        made = registry.make(env_id)
-        if not isinstance(made, GymnasiumEnvironment):
-            raise TypeError("it is not a Gymnasium environment, and has no bare loop")
-        self._environment = made
-        self._actions = self._drawn()
+def _stretch(environment: GymnasiumEnvironment) -> list[Any]:
+    """The actions of a stretch."""
+    rng = np.random.default_rng(0)
+    obs = environment.reset(CASE)
+    actions: list[Any] = []
+    processor, wall = time.process_time() + PROCESSOR_S, time.monotonic() + WALL_S
+    about = environment.description
+    most = min(STEPS if about.obs_storage == "inline" else PICTURES, about.max_episode_steps)
+    while len(actions) < most and time.process_time() < processor and time.monotonic() < wall:
+        actions.append(environment.draw(rng, obs))
+        step = environment.step(actions[-1])
+        obs = step.obs
+        if step.terminated or step.truncated:
+            break
+    return actions
 
-    def play(self) -> Stretch:
-        self._environment.reset(CASE)
-        step = self._environment.bare.step
-        below, began = proc.cpu_below_s(os.getpid()), time.process_time()
-        for action in self._actions:
-            step(action)
-        own = time.process_time() - began
-        return Stretch(own + proc.cpu_below_s(os.getpid()) - below, [literal(each) for each in self._actions])
 
-    def close(self) -> None:
-        self._environment.close()
-
-    def _drawn(self) -> list[Any]:
-        rng = np.random.default_rng(0)
-        obs = self._environment.reset(CASE)
-        drawn: list[Any] = []
-        processor, wall = time.process_time() + PROCESSOR_S, time.monotonic() + WALL_S
-        description = self._environment.description
-        most = min(STEPS if description.obs_storage == "inline" else PICTURES, description.max_episode_steps)
-        while len(drawn) < most and time.process_time() < processor and time.monotonic() < wall:
-            drawn.append(self._environment.draw(rng, obs))
-            step = self._environment.step(drawn[-1])
-            obs = step.obs
-            if step.terminated or step.truncated:
-                break
-        return drawn
+def _play(environment: GymnasiumEnvironment, actions: list[Any]) -> Stretch:
+    environment.reset(CASE)
+    step = environment.bare.step
+    below, began = proc.cpu_below_s(os.getpid()), time.process_time()
+    for action in actions:
+        step(action)
+    own = time.process_time() - began
+    return Stretch(own + proc.cpu_below_s(os.getpid()) - below, [literal(each) for each in actions])
 
 
 def literal(value: Any) -> Any:
@@ -98,17 +89,21 @@ def main() -> None:
     null = os.open(os.devnull, os.O_WRONLY)
     os.dup2(null, 1)
     os.dup2(null, 2)
-    player, played = None, ""
+    environment: Any = None
+    actions: list[Any] = []
     for line in sys.stdin.buffer:
         env_id = line.decode().strip()
         try:
-            if player is None or env_id != played:
-                if player is not None:
-                    player.close()
-                player, played = _Player(env_id), env_id
-            answer = player.play()
+            if environment is None or env_id != environment.description.env:
+                if environment is not None:
+                    environment.close()
+                environment = registry.make(env_id)
+                if not isinstance(environment, GymnasiumEnvironment):
+                    raise TypeError("it is not a Gymnasium environment, and has no bare loop")
+                actions = _stretch(environment)
+            answer = _play(environment, actions)
         except Exception as error:
-            player, answer = None, Stretch(fault=f"{type(error).__name__}: {error}"[:300])
+            environment, answer = None, Stretch(fault=f"{type(error).__name__}: {error}"[:300])
         answers.write(msgspec.json.encode(answer) + b"\n")
         answers.flush()
 

@@ -20,14 +20,9 @@ from evopolicy_worker.environments import registry
 def digests(known: dict[str, str], env_ids: Iterable[str]) -> dict[str, str]:
     """The first `DEFINITION_DIGITS` digits of each shipped definition's digest, by environment id. `known`: the
     previous ones. `env_ids`: those that are made."""
-    offered = set(registry.offered()) & set(env_ids)
-    found = {
-        env_id: registry.describe(env_id).digest()[:DEFINITION_DIGITS]
-        if env_id in offered
-        else known.get(env_id)
-        for env_id in catalogue.entries()
-    }
-    return {env_id: digest for env_id, digest in found.items() if digest}
+    chosen = set(registry.offered()) & set(env_ids)
+    made = {env_id: registry.describe(env_id).digest()[:DEFINITION_DIGITS] for env_id in chosen}
+    return {env_id: (known | made)[env_id] for env_id in catalogue.entries() if env_id in known | made}
 
 
 def main() -> None:

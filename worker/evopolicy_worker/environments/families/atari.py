@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Mapping
-from functools import cache
 from typing import Any
 
 from evopolicy_common.catalogue import Entry
@@ -12,20 +10,10 @@ from evopolicy_worker.environments.interface.gymnasium_adapter import GymnasiumF
 from evopolicy_worker.environments.interface.info import plain_info
 from evopolicy_worker.environments.tasks import template
 
-_OBSERVATION = (
-    "The screen: a picture with its rows from the top and its columns from the left, red, green and blue. Score and"
-    " lives can be seen in it where the game shows them."
-)
-_REWARD = (
-    "What the game's score has gained or lost in the step. `info['lives']` tells the lives that are left, 0 where a"
-    " game has none."
-)
 _PARTS = {"UP": "up", "DOWN": "down", "LEFT": "left", "RIGHT": "right", "FIRE": "fire button"}
 
 
 class AtariFamily(GymnasiumFamily):
-    """Atari games."""
-
     distributions = ("ale-py",)
     modules = ("gymnasium", "ale_py")
     extra = "atari"
@@ -57,16 +45,9 @@ class AtariFamily(GymnasiumFamily):
         if settings.get("repeat_action_probability"):
             duration += " Now and then, at random, the console goes on with the choice before."
         return {
-            "": _games()[settings["game"]],
-            "Observation": _OBSERVATION,
+            "": template.load("atari_games.toml")[settings["game"]],
             "Action": f"What is done with the joystick. {duration}\n\n"
             + template.table(("choice", "joystick"), choices),
-            "Reward": _REWARD,
-            "Start": (
-                "The game's beginning, the same in every episode. Where something is at random, the episode's seed"
-                " decides it."
-            ),
-            "End": "An episode ends when the game is over.",
         }
 
 
@@ -78,11 +59,6 @@ def _choice(meaning: str) -> str:
         parts.append(_PARTS[part])
         meaning = meaning.removeprefix(part)
     return " and ".join(parts) or "nothing"
-
-
-@cache
-def _games() -> dict[str, str]:
-    return tomllib.loads(template.read("atari_games.toml"))
 
 
 FAMILY = AtariFamily()

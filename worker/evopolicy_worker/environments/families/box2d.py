@@ -7,8 +7,6 @@ from evopolicy_worker.environments.interface.gymnasium_adapter import GymnasiumF
 
 
 class Box2DFamily(GymnasiumFamily):
-    """Walkers, landers and a racing car."""
-
     distributions = ("gymnasium", "box2d", "pygame-ce")
     modules = ("gymnasium", "Box2D", "pygame")
 

@@ -22,8 +22,6 @@ _PARAMETERS: dict[str, dict[str, tuple[str, ...]]] = {
 
 
 class ClassicFamily(GymnasiumFamily):
-    """Small worlds of a few numbers."""
-
     def parameters(self, env: gymnasium.Env[Any, Any]) -> Mapping[str, Sequence[Quantity]]:
         bare = env.unwrapped
         # An acceleration's class is derived from the library's.

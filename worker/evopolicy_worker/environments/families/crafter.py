@@ -20,11 +20,7 @@ from evopolicy_worker.environments.tasks import template
 
 _SIDE_FOR_PEOPLE = 360
 """Height and width of a frame for people, pixels."""
-_ABOUT = (
-    "A survival game in a world of squares, seen from above. Collect materials, make tools, eat, drink, sleep, and fend"
-    " off zombies and skeletons. There are 22 achievements; each pays once an episode."
-)
-_WHAT = {
+_EFFECTS = {
     "noop": "nothing",
     "do": "act on what is in front: collect a material, drink water, hit a creature, eat a ripe plant",
     "sleep": "sleep, which restores energy; one wakes up rested, or when hurt",
@@ -32,8 +28,6 @@ _WHAT = {
 
 
 class CrafterFamily(GymnasiumFamily):
-    """The game with its rewards."""
-
     distributions = ("crafter",)
     also = ("opensimplex", "pillow", "numba")
     modules = ("gymnasium", "crafter")
@@ -53,7 +47,6 @@ class CrafterFamily(GymnasiumFamily):
         choices = ((f"`{k}`", _choice(name)) for k, name in enumerate(constants.actions))
         achievements = ", ".join(f"`{name}`" for name in constants.achievements)
         return {
-            "": _ABOUT,
             "Action": f"One choice a step.\n\n{template.table(('choice', 'what it does'), choices)}\n\n"
             f"What is needed:\n\n{template.table(('for', 'of the inventory', 'where'), _needs(constants))}",
             "Reward": (
@@ -62,11 +55,6 @@ class CrafterFamily(GymnasiumFamily):
                 " `info['achievements']` how many have been unlocked so far, `info['inventory']` what is carried. The"
                 f" achievements: {achievements}."
             ),
-            "Start": (
-                "The seed of the episode decides the world. The player starts in its middle, on grass, with full"
-                " health, food, drink and energy."
-            ),
-            "End": "An episode ends with the player's death: health is used up, or the player walks into lava.",
         }
 
 
@@ -88,16 +76,15 @@ def _hasten() -> None:
 
 def _choice(name: str) -> str:
     """The effect of an action, from its name, such as `place_stone`."""
-    verb, _, what = name.partition("_")
-    what = what.replace("_", " ")
+    verb, _, thing = name.partition("_")
+    thing = thing.replace("_", " ")
     if verb == "move":
-        return f"turn {what}, and move there if the square is free"
+        return f"turn {thing}, and move there if the square is free"
     if verb == "place":
-        return f"put down a {what} in front" if what != "plant" else "plant a sapling in front"
+        return f"put down a {thing} in front" if thing != "plant" else "plant a sapling in front"
     if verb == "make":
-        article = "an" if what.startswith("iron") else "a"
-        return f"make {article} {what}"
-    return _WHAT[name]
+        return f"make {'an' if thing.startswith('iron') else 'a'} {thing}"
+    return _EFFECTS[name]
 
 
 def _needs(constants: Any) -> Iterator[tuple[str, str, str]]:
@@ -126,8 +113,6 @@ class _Ordered(dict[Any, None]):
 
 
 class _Game(Adapted):
-    """The game."""
-
     def __init__(self) -> None:
         import crafter
         from gymnasium import spaces

@@ -7,9 +7,6 @@ of other MuJoCo environments are.
 from __future__ import annotations
 
 import os
-import tomllib
-from collections.abc import Mapping
-from functools import cache
 from typing import Any
 
 import numpy as np
@@ -29,13 +26,10 @@ _UNITS = "Lengths are in metres, angles in radians, velocities by the second; x 
 
 
 class DmControlFamily(MujocoFamily):
-    """The suite's tasks."""
-
     distributions = ("dm-control", "mujoco")
     also = ("scipy", "lxml")
     modules = ("gymnasium", "mujoco", "dm_control")
     extra = "dm-control"
-    components: Mapping[str, Mapping[str, str]] = {}
 
     def load(self) -> None:
         import gymnasium  # noqa: F401
@@ -47,10 +41,8 @@ class DmControlFamily(MujocoFamily):
         try:
             from dm_control import suite  # noqa: F401
         finally:
-            if usual is None:
-                del os.environ["MUJOCO_GL"]
-            else:
-                os.environ["MUJOCO_GL"] = usual
+            del os.environ["MUJOCO_GL"]
+            os.environ |= {} if usual is None else {"MUJOCO_GL": usual}
 
     def make(self, entry: Entry, *, render: bool) -> Any:
         check_rendering(entry, render=render)
@@ -58,7 +50,7 @@ class DmControlFamily(MujocoFamily):
 
     def words(self, entry: Entry, env: Any) -> dict[str, str]:
         domain, task = _names(entry)
-        texts = _texts()[domain]
+        texts = template.load("dm_control_tasks.toml")[domain]
         objective, reward = texts["tasks"][task]
         parts = texts["observation"] | texts.get("also", {})
         rows = (
@@ -84,14 +76,7 @@ def _names(entry: Entry) -> tuple[str, str]:
     return domain, task
 
 
-@cache
-def _texts() -> dict[str, Any]:
-    return tomllib.loads(template.read("dm_control_tasks.toml"))
-
-
 class _Task(Adapted):
-    """A task of the suite."""
-
     def __init__(self, domain: str, task: str) -> None:
         import mujoco
         from dm_control import suite
@@ -99,7 +84,9 @@ class _Task(Adapted):
 
         self._task = suite.load(domain, task, task_kwargs={"random": _SYSTEM_SEED})
         self._physics: Any = self._task.physics
-        _without_opengl(self._physics)
+        # Nothing to draw with: some tasks would otherwise ask OpenGL for it in each reset.
+        own = type(self._physics)
+        self._physics.__class__ = type(own.__name__, (own,), {"contexts": None})
         self._renderer: Any = None
         spec = self._task.action_spec()
         low, high = (
@@ -126,9 +113,9 @@ class _Task(Adapted):
         return self._task.reset().observation, {}
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        found = self._task.step(action)
-        ended, truncated = found.last(), bool(found.discount)
-        return found.observation, found.reward, ended and not truncated, ended and truncated, {}
+        step = self._task.step(action)
+        ended, truncated = step.last(), bool(step.discount)
+        return step.observation, step.reward, ended and not truncated, ended and truncated, {}
 
     def render(self) -> Any:
         if self._renderer is None:
@@ -150,12 +137,6 @@ class _Task(Adapted):
         if self._renderer is not None:
             self._renderer.close()
             self._renderer = None
-
-
-def _without_opengl(physics: Any) -> None:
-    """Makes the simulation have nothing to draw with: some tasks would otherwise ask OpenGL for it in each reset."""
-    own = type(physics)
-    physics.__class__ = type(own.__name__, (own,), {"contexts": None})
 
 
 FAMILY = DmControlFamily()

@@ -19,8 +19,8 @@ from typing import Any
 from evopolicy_common.catalogue import Entry
 from evopolicy_common.errors import WorkerError
 from evopolicy_worker.environments.families import miniwob
-from evopolicy_worker.environments.interface.adapters import versions
 from evopolicy_worker.environments.interface.calls import unreadable
+from evopolicy_worker.environments.interface.fingerprint import versions
 from evopolicy_worker.environments.interface.gymnasium_adapter import GymnasiumFamily
 
 _OF_GYMNASIUM = ("mujoco", "box2d", "pygame-ce", "ale-py")
@@ -37,8 +37,6 @@ dropped: dict[str, dict[str, None]] = {}
 
 
 class ForeignFamily(GymnasiumFamily):
-    """Anyone's environments."""
-
     remembers = True
     measures = True
 

@@ -20,20 +20,9 @@ _TRAFFIC = {"DISTANCE_WANTED": 10.0, "COMFORT_ACC_MAX": 3.0, "COMFORT_ACC_MIN": 
 
 
 class HighwayFamily(GymnasiumFamily):
-    """Traffic, and a car to be parked."""
-
     distributions = ("highway-env",)
     also = ("pandas", "pygame-ce")
     modules = ("gymnasium", "highway_env")
-    components = {
-        "roundabout-v0": {
-            "collision_reward": "1 when the car has crashed, without its weight",
-            "high_speed_reward": "grows with the chosen speed, from 0 to 1, without its weight",
-            "lane_change_reward": "1 when a lane change was asked for, without its weight",
-            "on_road_reward": "1 on the road; the whole reward is 0 off it",
-        },
-    }
-
     solved_by = {"parking-v0": "is_success"}
 
     def rebuilds(self, entry: Entry) -> bool:

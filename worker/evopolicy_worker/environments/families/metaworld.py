@@ -7,8 +7,6 @@ also chooses the task, which the observation names.
 
 from __future__ import annotations
 
-import tomllib
-from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -26,20 +24,17 @@ _GOAL = slice(36, 39)
 
 
 class MetaWorldFamily(MujocoFamily):
-    """Tasks of an arm on a table."""
-
     distributions = ("metaworld", "mujoco")
     also = ("scipy",)
     modules = ("gymnasium", "mujoco", "metaworld")
     extra = "metaworld"
-    components: Mapping[str, Mapping[str, str]] = {}
 
     def make(self, entry: Entry, *, render: bool) -> Any:
         check_rendering(entry, render=render)
         return _Tasks(_names(entry), render=render)
 
     def words(self, entry: Entry, env: Any) -> dict[str, str]:
-        tasks = tomllib.loads(template.read("metaworld_tasks.toml"))
+        tasks = template.load("metaworld_tasks.toml")
         names = _names(entry)
         if len(names) == 1:
             return {"": tasks[names[0]]}
@@ -57,8 +52,7 @@ def _names(entry: Entry) -> list[str]:
         return [str(entry.kwargs["env_name"])]
     from metaworld import env_dict
 
-    suite = env_dict.MT10_V3 if str(entry.gymnasium_id).endswith("MT10") else env_dict.MT50_V3
-    return list(suite)
+    return list(env_dict.MT10_V3 if str(entry.gymnasium_id).endswith("MT10") else env_dict.MT50_V3)
 
 
 class _Tasks(Adapted):
@@ -73,9 +67,9 @@ class _Tasks(Adapted):
         self._names = names
         self._render = render
         self._index = 0
-        self._task: Any = _task(names[0], render=render)
-        self.action_space = self._task.action_space
-        space = self._task.sawyer_observation_space
+        self.raw = _task(names[0], render=render)
+        self.action_space = self.raw.action_space
+        space = self.raw.sawyer_observation_space
         low, high = space.low.copy(), space.high.copy()
         if len(names) > 1:
             # The goals of other tasks lie elsewhere.
@@ -86,22 +80,19 @@ class _Tasks(Adapted):
     def reset(self, *, seed: int, options: Any = None) -> tuple[Any, dict[str, Any]]:
         index = int(np.random.default_rng(seed).integers(len(self._names))) if len(self._names) > 1 else 0
         if index != self._index:
-            self._task.close()
-            self._index, self._task = index, _task(self._names[index], render=self._render)
-        self._task.seed(seed)
-        obs, info = self._task.reset()
+            self.raw.close()
+            self._index, self.raw = index, _task(self._names[index], render=self._render)
+        self.raw.seed(seed)
+        obs, info = self.raw.reset()
         return self._named(obs), info
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        obs, reward, terminated, truncated, info = self._task.step(action)
+        obs, reward, terminated, truncated, info = self.raw.step(action)
         return self._named(obs), reward, terminated, truncated, info
 
     def render(self) -> Any:
         # The camera hangs upside down.
-        return np.rot90(self._task.render(), 2)
-
-    def close(self) -> None:
-        self._task.close()
+        return np.rot90(super().render(), 2)
 
     def _named(self, obs: Any) -> Any:
         if len(self._names) == 1:

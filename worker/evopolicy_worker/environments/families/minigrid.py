@@ -15,8 +15,6 @@ _MISSION_CHARACTERS = 512
 
 
 class MiniGridFamily(GymnasiumFamily):
-    """Doors, keys and rooms."""
-
     distributions = ("minigrid",)
     modules = ("gymnasium", "minigrid")
 

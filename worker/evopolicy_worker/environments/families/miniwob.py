@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pkgutil
 import re
 from typing import TYPE_CHECKING, Any
 
@@ -11,26 +12,23 @@ from evopolicy_common.catalogue import Entry
 from evopolicy_worker.environments.browser import chromium, miniwob_pages
 from evopolicy_worker.environments.browser.page import shared
 from evopolicy_worker.environments.interface.actions import ActionCodec
-from evopolicy_worker.environments.interface.adapters import versions
+from evopolicy_worker.environments.interface.fingerprint import versions
 from evopolicy_worker.environments.interface.gymnasium_adapter import GymnasiumFamily
 
 if TYPE_CHECKING:
     import gymnasium
 
-    from evopolicy_worker.environments.browser.page_env import PageEnv
-
 
 class MiniWoBFamily(GymnasiumFamily):
-    """Its pages with its own spaces."""
-
     distributions = ("miniwob",)
     modules = ("gymnasium", "miniwob")
     extra = "browser"
     sources = ("environments/browser/*",)
     remembers = True
     measures = True
-    prefix = "miniwob/"
-    suffix = "-v1"
+    prefix, suffix = "miniwob/", "-v1"
+    environment = "miniwob_env:MiniWoBEnv"
+    """Module and class of its environments."""
 
     def installed(self) -> bool:
         return super().installed() and not chromium.lacking()
@@ -45,10 +43,9 @@ class MiniWoBFamily(GymnasiumFamily):
 
     def make(self, entry: Entry, *, render: bool) -> gymnasium.Env[Any, Any]:
         """The page that the id names."""
-        name = self._page(entry)
-        made: gymnasium.Env[Any, Any] = self.environment()(
-            name, **entry.kwargs, render_mode="rgb_array" if render else None
-        )
+        kind = pkgutil.resolve_name(f"{chromium.__package__}.{self.environment}")
+        mode = "rgb_array" if render else None
+        made: gymnasium.Env[Any, Any] = kind(self._page(entry), **entry.kwargs, render_mode=mode)
         return made
 
     def words(self, entry: Entry, env: gymnasium.Env[Any, Any]) -> dict[str, str]:
@@ -65,12 +62,6 @@ class MiniWoBFamily(GymnasiumFamily):
 
     def _page(self, entry: Entry) -> str:
         return str(entry.gymnasium_id).removeprefix(self.prefix).removesuffix(self.suffix)
-
-    def environment(self) -> type[PageEnv]:
-        """The class of its environments."""
-        from evopolicy_worker.environments.browser.miniwob_env import MiniWoBEnv
-
-        return MiniWoBEnv
 
     def draw(self, codec: ActionCodec, rng: np.random.Generator, obs: Any) -> Any:
         from evopolicy_worker.environments.browser import draws

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Callable
-from ctypes.util import find_library
 from functools import cache
 from typing import Any
 
 from evopolicy_common.catalogue import Entry
-from evopolicy_common.errors import WorkerError
-from evopolicy_common.processes import distribution
+from evopolicy_worker.environments.families.mujoco import check_rendering
 from evopolicy_worker.environments.interface.gymnasium_adapter import GymnasiumFamily
 from evopolicy_worker.environments.tasks import template
 
@@ -29,30 +26,9 @@ _ACTIONS = (
     "nothing: no object here can be toggled",
     "nothing: no task here needs to be declared done",
 )
-_GOAL_REWARD = (
-    "0 each step. The step that reaches the goal pays between 1 and 0.8: the fewer steps it took, the more, falling"
-    " evenly up to the step limit."
-)
-_REWARDS = {
-    "CollectHealth": "2 each step; -100 for the step in which health is used up.",
-    "PickupObjects": "1 for each object that is picked up, otherwise 0.",
-    "RoomObjects": "0 each step.",
-    "ThreeRooms": "0 each step.",
-    "Sign": "0 each step; 1 for touching the right object, -1 for touching another one.",
-}
-_ENDS = {
-    "CollectHealth": "An episode ends when health is used up.",
-    "PickupObjects": "An episode ends when all objects are picked up.",
-    "RoomObjects": "Nothing ends an episode early.",
-    "ThreeRooms": "Nothing ends an episode early.",
-    "Sidewalk": "An episode ends at the goal, and without reward on the street.",
-    "Sign": "An episode ends when an object is touched, and with choice 3.",
-}
 
 
 class MiniWorldFamily(GymnasiumFamily):
-    """Rooms and mazes."""
-
     distributions = ("miniworld",)
     also = ("pyglet",)
     modules = ("gymnasium", "miniworld")
@@ -61,49 +37,41 @@ class MiniWorldFamily(GymnasiumFamily):
 
     def make(self, entry: Entry, *, render: bool) -> Any:
         """As others; observations are drawn, so WorkerError where the host has no EGL."""
-        if find_library("EGL") is None:
-            raise WorkerError(
-                f"{entry.id} draws its observations with EGL, which is not installed: {distribution.install('egl')}"
-            )
+        check_rendering(entry, render=True, verb="draws its observations")
         import gymnasium
 
         assert entry.gymnasium_id is not None
         _root().switch_to()
         # The window for people takes sixty megabytes even when it is not shown.
         width, height = _PICTURE_FOR_PEOPLE if render else (1, 1)
-        mode: dict[str, Any] = {
-            "render_mode": "rgb_array" if render else None,
-            "window_width": width,
-            "window_height": height,
-        }
-        env = gymnasium.make(entry.gymnasium_id, disable_env_checker=True, **mode)
+        size: dict[str, Any] = {"window_width": width, "window_height": height}
+        mode = "rgb_array" if render else None
+        env = gymnasium.make(entry.gymnasium_id, disable_env_checker=True, render_mode=mode, **size)
         _in_its_context(env.unwrapped)
         return env
 
     def packages(self, entry: Entry) -> dict[str, str]:
         """With the OpenGL that draws: other versions draw other pixels."""
-        return super().packages(entry) | {"opengl": _opengl()}
+        from pyglet.gl import gl_info
+
+        version = f"{gl_info.get_version()} {gl_info.get_renderer()}"[:120]
+        return super().packages(entry) | {"opengl": version}
 
     def words(self, entry: Entry, env: Any) -> dict[str, str]:
-        name = str(entry.gymnasium_id).split("-")[1]
+        name, texts = str(entry.gymnasium_id).split("-")[1], template.load("miniworld_rooms.toml")
         meanings = (*_ACTIONS[:3], "end the episode") if name == "Sign" else _ACTIONS[: env.action_space.n]
         choices = ((f"`{k}`", meaning) for k, meaning in enumerate(meanings))
         observation = f"The observation is {_PICTURE}."
         if name == "Sign":
             observation = f"`obs` is {_PICTURE}. `goal` is 0 for a box and 1 for a key."
         return {
-            "": _rooms()[name],
+            "": texts[name],
             "Observation": observation,
             "Action": f"A small movement each.\n\n{template.table(('choice', 'what it does'), choices)}",
-            "Reward": _REWARDS.get(name, _GOAL_REWARD),
-            "Start": "The seed of the episode decides where the agent starts and, in most rooms, where objects are.",
-            "End": _ENDS.get(name, "An episode ends when the goal is reached."),
+            "Reward": texts["reward"].get(name, texts["reward"]["goal"]),
+            "Start": texts["start"],
+            "End": texts["end"].get(name, texts["end"]["goal"]),
         }
-
-
-@cache
-def _rooms() -> dict[str, str]:
-    return tomllib.loads(template.read("miniworld_rooms.toml"))
 
 
 @cache
@@ -139,13 +107,6 @@ def _in_its_context(room: Any) -> None:
             _root().switch_to()
 
     room.close = close
-
-
-def _opengl() -> str:
-    """Version and renderer of the OpenGL in use, in a few words. An environment must have been made."""
-    from pyglet.gl import gl_info
-
-    return f"{gl_info.get_version()} {gl_info.get_renderer()}"[:120]
 
 
 FAMILY = MiniWorldFamily()

@@ -16,13 +16,10 @@ from evopolicy_worker.environments.tasks import highway, template
 
 
 class MoGymnasiumFamily(MujocoFamily):
-    """Tasks with several objectives."""
-
     distributions = ("mo-gymnasium",)
     also = ("mujoco", "box2d", "highway-env", "pygame", "scipy", "imageio")
     modules = ("gymnasium", "mo_gymnasium")
     extra = "mo-gymnasium"
-    components = {}
 
     def rebuilds(self, entry: Entry) -> bool:
         # Made from Box2D, MuJoCo, highway-env and others, of which some do not repeat.
@@ -48,35 +45,29 @@ class _MadeFromSeed(Adapted):
 
     def __init__(self, make: Callable[[], Any]) -> None:
         self._make = make
-        self._env = make()
-        self.metadata, self.spec = self._env.metadata, self._env.spec
-        self.observation_space, self.action_space = self._env.observation_space, self._env.action_space
+        self.raw = make()
+        self.metadata, self.spec = self.raw.metadata, self.raw.spec
+        self.observation_space, self.action_space = self.raw.observation_space, self.raw.action_space
         self._max_episode_steps = self.spec.max_episode_steps if self.spec is not None else None
 
     @property
     def unwrapped(self) -> Any:
-        return self._env.unwrapped
+        return self.raw.unwrapped
 
     def reset(self, *, seed: int, options: Any = None) -> Any:
-        self._env.close()
+        self.raw.close()
         np.random.seed(seed)
-        self._env = self._make()
-        return self._env.reset(seed=seed, options=options)
-
-    def step(self, action: Any) -> Any:
-        return self._env.step(action)
+        self.raw = self._make()
+        return self.raw.reset(seed=seed, options=options)
 
     def render(self) -> Any:
         # The first frame turns each mine by a number of the same generator: an episode that is drawn stays the same
         # one.
         state = np.random.get_state()
         try:
-            return self._env.render()
+            return super().render()
         finally:
             np.random.set_state(state)
-
-    def close(self) -> None:
-        self._env.close()
 
 
 FAMILY = MoGymnasiumFamily()

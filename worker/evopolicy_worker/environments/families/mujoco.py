@@ -16,28 +16,8 @@ if TYPE_CHECKING:
 
 
 class MujocoFamily(GymnasiumFamily):
-    """Articulated bodies."""
-
     distributions: tuple[str, ...] = ("gymnasium", "mujoco")
     modules: tuple[str, ...] = ("gymnasium", "mujoco")
-    components: Mapping[str, Mapping[str, str]] = {
-        "Reacher-v5": {
-            "reward_dist": "cost of the distance between fingertip and target",
-            "reward_ctrl": "cost of torque",
-        },
-        "HalfCheetah-v5": {"reward_forward": "forward speed", "reward_ctrl": "cost of torque"},
-        "Ant-v5": {
-            "reward_forward": "speed along positive x",
-            "reward_ctrl": "cost of torque",
-            "reward_contact": "cost of contact forces",
-            "reward_survive": "bonus while healthy",
-        },
-        "Pusher-v5": {
-            "reward_dist": "cost of the distance between cylinder and goal",
-            "reward_ctrl": "cost of torque",
-            "reward_near": "cost of the distance between wrist and cylinder",
-        },
-    }
 
     def make(self, entry: Entry, *, render: bool) -> gymnasium.Env[Any, Any]:
         """As in other families. Raises WorkerError when an image is requested and the host has no EGL to render it."""
@@ -66,11 +46,11 @@ class MujocoFamily(GymnasiumFamily):
         mujoco.mj_setConst(bare.model, bare.data)
 
 
-def check_rendering(entry: Entry, *, render: bool) -> None:
+def check_rendering(entry: Entry, *, render: bool, verb: str = "renders") -> None:
     """Raises WorkerError when an image is requested and the host has no EGL to render it."""
     if render and find_library("EGL") is None:
         raise WorkerError(
-            f"{entry.id} renders with EGL, which is not installed: {distribution.install('egl')}"
+            f"{entry.id} {verb} with EGL, which is not installed: {distribution.install('egl')}"
         )
 
 

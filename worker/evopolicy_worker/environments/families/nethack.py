@@ -10,7 +10,6 @@ from __future__ import annotations
 import _ctypes
 import ctypes
 import os
-import tomllib
 from collections.abc import Mapping
 from functools import cache
 from pathlib import Path
@@ -21,7 +20,6 @@ from numpy.typing import NDArray
 
 from evopolicy_common.catalogue import Entry, installs
 from evopolicy_worker.environments.interface import spaces
-from evopolicy_worker.environments.interface.adapters import versions
 from evopolicy_worker.environments.interface.gymnasium_adapter import Adapted, GymnasiumFamily
 from evopolicy_worker.environments.tasks import template
 
@@ -41,8 +39,6 @@ _PALETTE = np.array(
 
 
 class NetHackFamily(GymnasiumFamily):
-    """Games of NetHack."""
-
     distributions = ("nle", "minihack")
     modules = ("gymnasium", "nle", "minihack")
     extra = "nethack"
@@ -56,27 +52,23 @@ class NetHackFamily(GymnasiumFamily):
         options = {"disable_env_checker": True, "fix_moon_phase": True, **entry.kwargs}
         return _Game(gymnasium.make(entry.gymnasium_id, **options).unwrapped)
 
-    def packages(self, entry: Entry) -> dict[str, str]:
-        return versions(("numpy", "gymnasium", *self.distributions[: 1 + _is_minihack(entry)]))
-
-    def version(self, entry: Entry) -> str:
-        names = self.distributions[: 1 + _is_minihack(entry)]
-        return (
-            f"{entry.gymnasium_id} ({', '.join(f'{name} {each}' for name, each in versions(names).items())})"
-        )
+    def decisive(self, entry: Entry) -> tuple[str, ...]:
+        return self.distributions if _is_minihack(entry) else self.distributions[:1]
 
     def needs(self) -> str:
         return f"{super().needs()} and then pip install --no-deps {' '.join(installs.apart((self.extra,)))}"
 
     def words(self, entry: Entry, env: Any) -> dict[str, str]:
-        common = _words("nethack_words.toml")
+        common = template.load("nethack_words.toml")
         seen = (
             (f"`{name}`", common["observation"][name], template.words(spaces.to_schema(space)))
             for name, space in env.observation_space.spaces.items()
         )
         choices = ((f"`{k}`", _choice(each, common)) for k, each in enumerate(env.actions))
-        kind, name = _name(entry)
-        rows = _words("nethack_tasks.toml")[kind]
+        # The package whose task it is, and its name without the part that all have in common.
+        kind, prefix = ("minihack", "MiniHack-") if _is_minihack(entry) else ("nethack", "NetHack")
+        name = str(entry.gymnasium_id).removeprefix(prefix)
+        rows = template.load("nethack_tasks.toml")[kind]
         row = rows[max((key for key in rows if name.startswith(key)), key=len)]
         reward = row.get("reward", common[kind]["reward"])
         return {
@@ -90,10 +82,8 @@ class NetHackFamily(GymnasiumFamily):
 
 
 class _Game(Adapted):
-    """A game as one environment."""
-
     def __init__(self, raw: Any) -> None:
-        self._raw = raw
+        self.raw = raw
         self.observation_space, self.action_space = raw.observation_space, raw.action_space
         self.actions: tuple[Any, ...] = tuple(raw.actions)
         self._folder = Path(raw.nethack._vardir)
@@ -103,27 +93,25 @@ class _Game(Adapted):
     def reset(self, *, seed: int, options: Any = None) -> tuple[Any, dict[str, Any]]:
         self._forget()
         # Not 0, with which the moon would follow the clock.
-        self._raw.seed(seed + 1, seed + 1, False)
-        obs, info = self._raw.reset()
-        _set_birthday(self._raw.nethack.dlpath)
+        self.raw.seed(seed + 1, seed + 1, False)
+        obs, info = self.raw.reset()
+        _set_birthday(self.raw.nethack.dlpath)
         return obs, _info(info)
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        obs, reward, terminated, truncated, info = self._raw.step(action)
+        obs, reward, terminated, truncated, info = self.raw.step(action)
         # At its step limit a game is abandoned and reports that it has ended.
         aborted = info["end_status"].name == "ABORTED"
         return obs, reward, terminated and not aborted, truncated or aborted, _info(info)
 
     def render(self) -> NDArray[np.uint8]:
-        raw = self._raw
-        chars, colours, cursor = (
-            raw.last_observation[raw._observation_keys.index(f"tty_{name}")]
-            for name in ("chars", "colors", "cursor")
-        )
-        return _picture(chars, colours, cursor)
-
-    def close(self) -> None:
-        self._raw.close()
+        """The terminal as a picture, 264 × 480."""
+        seen = dict(zip(self.raw._observation_keys, self.raw.last_observation, strict=True))
+        drawn = _letters()[seen["tty_chars"]]
+        drawn[tuple(seen["tty_cursor"])] ^= True
+        cells = np.where(drawn[..., None], _PALETTE[seen["tty_colors"] & 15][:, :, None, None], 0)
+        rows, columns, height, width = drawn.shape
+        return cells.transpose(0, 2, 1, 3, 4).reshape(rows * height, columns * width, 3).astype(np.uint8)
 
     def _forget(self) -> None:
         """Removes what earlier games have left in the folder of files."""
@@ -157,12 +145,6 @@ def _set_birthday(library: str) -> None:
         _ctypes.dlclose(loaded._handle)
 
 
-def _name(entry: Entry) -> tuple[str, str]:
-    """Which package's task an environment is, and its name without what all have in common."""
-    kind, prefix = ("minihack", "MiniHack-") if _is_minihack(entry) else ("nethack", "NetHack")
-    return kind, str(entry.gymnasium_id).removeprefix(prefix)
-
-
 def _choice(action: Any, common: Mapping[str, Any]) -> str:
     """The effect of an action."""
     kind, name = type(action).__name__, action.name
@@ -184,31 +166,17 @@ def _key(code: int) -> str:
 
 
 @cache
-def _words(name: str) -> dict[str, Any]:
-    return tomllib.loads(template.read(name))
-
-
-def _picture(chars: NDArray[Any], colours: NDArray[Any], cursor: NDArray[Any]) -> NDArray[np.uint8]:
-    """The terminal as a picture, 264 × 480."""
-    drawn = _letters()[chars]
-    drawn[tuple(cursor)] ^= True
-    cells = np.where(drawn[..., None], _PALETTE[colours & 15][:, :, None, None], 0)
-    rows, columns, height, width = drawn.shape
-    return cells.transpose(0, 2, 1, 3, 4).reshape(rows * height, columns * width, 3).astype(np.uint8)
-
-
-@cache
 def _letters() -> NDArray[np.bool_]:
     """The set pixels of each of the 256 characters, in cells of 11 × 6 pixels."""
     from PIL import Image, ImageDraw, ImageFont
 
     font = ImageFont.load_default_imagefont()
-    found = []
+    letters = []
     for code in range(256):
         cell = Image.new("L", (6, 11))
         ImageDraw.Draw(cell).text((0, 0), chr(code), fill=255, font=font)
-        found.append(np.asarray(cell) > 127)
-    return np.stack(found)
+        letters.append(np.asarray(cell) > 127)
+    return np.stack(letters)
 
 
 def _is_minihack(entry: Entry) -> bool:

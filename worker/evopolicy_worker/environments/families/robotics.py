@@ -14,11 +14,8 @@ if TYPE_CHECKING:
 
 
 class RoboticsFamily(MujocoFamily):
-    """Arms, hands and walkers, with goals."""
-
     distributions = ("gymnasium-robotics", "mujoco")
     modules = ("gymnasium", "mujoco", "gymnasium_robotics")
-    components = {}
     solved_by = {"FetchPush-v4": "is_success", "FetchPickAndPlace-v4": "is_success"}
 
     def make(self, entry: Entry, *, render: bool) -> gymnasium.Env[Any, Any]:

@@ -17,15 +17,9 @@ import numpy as np
 from evopolicy_common.catalogue import Entry
 from evopolicy_common.messages.environment import Case, EnvironmentDescription, SpaceSchema
 from evopolicy_worker.environments.interface.actions import compile_actions
-from evopolicy_worker.environments.interface.adapters import adapter, versions
 from evopolicy_worker.environments.interface.base import Environment, Frame, Observation, Step
+from evopolicy_worker.environments.interface.fingerprint import adapter, versions
 from evopolicy_worker.environments.tasks import written
-
-
-def make(entry: Entry, *, render: bool) -> Environment:
-    """The toy environment of that catalogue entry."""
-    kind = Line if entry.id == "toy/line" else Maze
-    return kind(entry, render=render)
 
 
 class _Toy(Environment):
@@ -152,20 +146,17 @@ class Maze(_Toy):
         return {"type": "Dict", "spaces": parts}, {"type": "Discrete", "n": 4}
 
     def reset(self, case: Case) -> Observation:
-        rng = np.random.default_rng(case.seed)
+        rng, inner = np.random.default_rng(case.seed), self.SIZE - 2
         while True:
-            inner = self.SIZE - 2
             # A border two cells wide, so that the 5 × 5 view never leaves the array.
             grid = np.full((self.SIZE + 2, self.SIZE + 2), self.WALL, dtype=np.uint8)
             grid[2:-2, 2:-2] = rng.random((inner, inner)) < self.WALL_SHARE
-            (row, column, exit_row, exit_column) = (int(k) + 2 for k in rng.integers(inner, size=4))
-            grid[row, column] = self.FREE
-            grid[exit_row, exit_column] = self.EXIT
-            if self._path(grid, (row, column), (exit_row, exit_column)) >= self.MIN_PATH:
+            row, column, *ends = (int(k) + 2 for k in rng.integers(inner, size=4))
+            grid[row, column], grid[tuple(ends)] = self.FREE, self.EXIT
+            if self._path(grid, (row, column), (ends[0], ends[1])) >= self.MIN_PATH:
                 break
         self._grid, self._row, self._column = grid, row, column
-        self._exit = (exit_row, exit_column)
-        self._steps = 0
+        self._exit, self._steps = (ends[0], ends[1]), 0
         return self._observe()
 
     def step(self, action: Any) -> Step:

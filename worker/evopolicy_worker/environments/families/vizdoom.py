@@ -13,8 +13,6 @@ import os
 import shlex
 import signal
 import tempfile
-import tomllib
-from functools import cache
 from itertools import compress
 from pathlib import Path
 from typing import Any
@@ -35,8 +33,6 @@ _SHARED = "/dev/shm"
 
 
 class VizdoomFamily(GymnasiumFamily):
-    """Scenarios and levels."""
-
     distributions = ("vizdoom",)
     modules = ("gymnasium", "vizdoom")
     extra = "vizdoom"
@@ -57,15 +53,23 @@ class VizdoomFamily(GymnasiumFamily):
         return _scenario(entry) == "Freedoom"
 
     def words(self, entry: Entry, env: Any) -> dict[str, str]:
-        texts, common = _texts()[_scenario(entry)], _texts()["common"]
+        scenarios = template.load("vizdoom_scenarios.toml")
+        texts, common = scenarios[_scenario(entry)], scenarios["common"]
         numbers = [f"`[{k}]` {common['variable'][each]}" for k, each in enumerate(env.variables)]
         parts = {**common["observation"], **texts.get("observation", {}), "gamevariables": "; ".join(numbers)}
+        # The package's bounds of numbers are those of the type.
         seen = (
-            (f"`{name}`", parts[name], _form(name, space))
+            (
+                f"`{name}`",
+                parts[name],
+                f"an array of shape {space.shape} of float32"
+                if name == "gamevariables"
+                else template.words(spaces.to_schema(space)),
+            )
             for name, space in env.observation_space.spaces.items()
         )
         return {
-            "": f"{texts['about']}{_level(entry)}",
+            "": texts["about"] + _level(entry),
             "Observation": "A dict. The observation after the last step is all zeros.\n\n"
             + template.table(("component", "what it is", "form"), seen),
             "Action": _actions(env, common["button"]),
@@ -76,51 +80,49 @@ class VizdoomFamily(GymnasiumFamily):
 
 
 class _Game(Adapted):
-    """A scenario or level."""
-
     def __init__(self, raw: Any) -> None:
         """`raw`: the package's environment, whose game has not begun."""
         from gymnasium import spaces
 
-        self._raw = raw
+        self.raw = raw
         self._folder = tempfile.TemporaryDirectory(prefix="doom-")
         self.observation_space, self.action_space = raw.observation_space, raw.action_space
         self.variables = tuple(each.name for each in raw.game.get_available_game_variables())
         buttons = tuple(each.name for each in raw.game.get_available_buttons())
         self.deltas, self.buttons = buttons[: raw.num_delta_buttons], buttons[raw.num_delta_buttons :]
-        self.choices: tuple[tuple[int, ...], ...] | None = None
+        self.choices = (
+            tuple(tuple(map(int, row)) for row in raw.button_map) if raw.max_buttons_pressed else None
+        )
         """Which buttons each choice presses; None where each button is chosen by itself."""
-        if raw.max_buttons_pressed:
-            self.choices = tuple(tuple(map(int, row)) for row in raw.button_map)
         if self.deltas:
             bounded = spaces.Box(-MOST_DELTA, MOST_DELTA, (len(self.deltas),), np.float32)
             self.action_space = spaces.Dict([("binary", raw.action_space["binary"]), ("continuous", bounded)])
 
     def reset(self, *, seed: int, options: Any = None) -> Any:
-        if self._raw.game.is_running():
-            return self._raw.reset(seed=seed)
+        if self.raw.game.is_running():
+            return self.raw.reset(seed=seed)
         _check_shared_memory()
-        self._raw.game.set_vizdoom_path(_program(Path(self._folder.name)))
+        self.raw.game.set_vizdoom_path(_program(Path(self._folder.name)))
         before = os.getcwd()
         os.chdir(self._folder.name)
         try:
-            return self._raw.reset(seed=seed)
+            return self.raw.reset(seed=seed)
         finally:
             os.chdir(before)
             _remove_names()
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        obs, reward, ended, truncated, info = self._raw.step(action)
+        obs, reward, ended, truncated, info = self.raw.step(action)
         # A game that its own time limit ends counts as both.
         return obs, reward, ended and not truncated, truncated, info
 
     def render(self) -> Any:
-        state = self._raw.state
+        state = self.raw.state
         shape = self.observation_space["screen"].shape
         return np.zeros(shape, np.uint8) if state is None else state.screen_buffer
 
     def close(self) -> None:
-        self._raw.close()
+        super().close()
         self._folder.cleanup()
 
 
@@ -173,13 +175,6 @@ def _level(entry: Entry) -> str:
     return f" This is level {name[1:]} of part {name[0]}, at skill {skill[1]} of 5, where 5 is the hardest."
 
 
-def _form(name: str, space: Any) -> str:
-    # The package's bounds of numbers are those of the type.
-    if name == "gamevariables":
-        return f"an array of shape {space.shape} of float32"
-    return template.words(spaces.to_schema(space))
-
-
 def _actions(game: _Game, effects: dict[str, str]) -> str:
     """The buttons, as the action space has them."""
     binary = [effects[name] for name in game.buttons]
@@ -197,11 +192,6 @@ def _actions(game: _Game, effects: dict[str, str]) -> str:
 
 def _numbered(head: tuple[str, str], effects: list[str]) -> str:
     return template.table(head, ((f"`{k}`", each) for k, each in enumerate(effects)))
-
-
-@cache
-def _texts() -> dict[str, Any]:
-    return tomllib.loads(template.read("vizdoom_scenarios.toml"))
 
 
 FAMILY = VizdoomFamily()

@@ -63,7 +63,8 @@ def compile_actions(schema: SpaceSchema) -> ActionCodec:
 
 class _Discrete(ActionCodec):
     def __init__(self, schema: SpaceSchema) -> None:
-        self._n, self._low = schema["n"], schema.get("start", 0)
+        self._n: int = schema["n"]
+        self._low: int = schema.get("start", 0)
         self._high = self._low + self._n - 1
 
     def repair(self, raw: object) -> tuple[int, bool]:

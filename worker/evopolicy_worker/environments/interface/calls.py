@@ -90,17 +90,14 @@ class Guard:
     def __init__(self, limits: Limits) -> None:
         self._limits = limits
         self._call: tuple[str, Kind, int] = ("", "", 0)
-        self._spent_s = 0.0
-        self._checked = 0.0
-        self._weighed = 0.0
+        self._spent_s = self._checked = self._weighed = 0.0
 
     def check(self, now: float) -> str:
         """Which limit was passed, with the remedy; empty when none was. `now`: monotonic seconds."""
         call = current.env, current.what, current.step
         since = min(now - self._checked, _LONGEST_CHECK_S)
-        self._checked = now
         self._spent_s = self._spent_s + since if call == self._call and call[1] else 0.0
-        self._call = call
+        self._checked, self._call = now, call
         if self._spent_s > self._limits.call_s:
             return hung(str(current), self._limits)
         if now - self._weighed >= _MEMORY_CHECK_S:
@@ -202,10 +199,9 @@ def raised(error: BaseException, text: str, limits: Limits) -> str:
     if not current.what or isinstance(error, SandboxError | SlotDiedError):
         return ""
     if isinstance(error, MemoryError):
-        most = limits.memory_bytes >> 20
         return (
             f"{current}: there is no memory left for it; mend what it keeps, or raise the worker's --env-memory"
-            f" ({most:,} MiB)"
+            f" ({limits.memory_bytes >> 20:,} MiB)"
         )
     if isinstance(error, EvopolicyError):
         return text

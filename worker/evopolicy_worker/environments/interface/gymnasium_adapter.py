@@ -8,31 +8,30 @@ their family is made, and not before: this module imports none.
 from __future__ import annotations
 
 import contextlib
+import difflib
 import importlib
 import io
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
-from importlib.metadata import version
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from evopolicy_common.catalogue import USUAL_STEPS, Entry, is_shipped
+from evopolicy_common.catalogue import USUAL_STEPS, Entry, Wrapper, is_shipped
 from evopolicy_common.errors import EvopolicyError, WorkerError
 from evopolicy_common.installation import add_extra
 from evopolicy_common.messages.environment import Case, EnvironmentDescription, SpaceSchema
 from evopolicy_worker.environments.accelerations import accelerate
 from evopolicy_worker.environments.interface import rewards, settings, spaces, trial
 from evopolicy_worker.environments.interface.actions import ActionCodec, compile_actions
-from evopolicy_worker.environments.interface.adapters import adapter, versions
 from evopolicy_worker.environments.interface.base import Environment, Frame, Observation, Step
 from evopolicy_worker.environments.interface.calls import current as call
 from evopolicy_worker.environments.interface.calls import described
+from evopolicy_worker.environments.interface.fingerprint import adapter, versions
 from evopolicy_worker.environments.interface.info import plain_info
 from evopolicy_worker.environments.interface.observations import compile_observation
 from evopolicy_worker.environments.interface.opaque import Opaque, converter, declared, visible
-from evopolicy_worker.environments.interface.wrappers import wrapped
 from evopolicy_worker.environments.tasks import task_text
 from evopolicy_worker.environments.tasks.template import About
 
@@ -62,9 +61,6 @@ class GymnasiumFamily:
     """Of this software, that installs them."""
     revision: int = 1
     """Counts up when the hooks of this class change what an environment plays: scores of several are not compared."""
-    components: Mapping[str, Mapping[str, str]] = {}
-    """Parts of the reward, by Gymnasium id: their names in `info` (or in its `rewards`), and what each stands for."""
-
     solved_by: Mapping[str, str] = {}
     """By Gymnasium id, `Environment.solved_by`."""
     remembers = False
@@ -143,28 +139,42 @@ class GymnasiumFamily:
         """Sections of the generated task text, by heading, in place of the documentation's; "" is what it is about."""
         return {}
 
+    def decisive(self, entry: Entry) -> tuple[str, ...]:
+        """The distributions whose versions name the environment, besides those of all."""
+        return self.distributions
+
     def packages(self, entry: Entry) -> dict[str, str]:
         """Versions of the distributions that decide this environment's numbers."""
-        return versions(("numpy", "gymnasium", *self.distributions, *self.also))
+        return versions(("numpy", "gymnasium", *self.decisive(entry), *self.also))
 
     def version(self, entry: Entry) -> str:
         """The environment with the versions that determine its episodes: `Ant-v5 (gymnasium 1.4.0, mujoco 3.10.0)`."""
-        versions = ", ".join(f"{name} {version(name)}" for name in self.distributions)
-        return f"{entry.gymnasium_id} ({versions})"
+        packages = ", ".join(f"{name} {each}" for name, each in versions(self.decisive(entry)).items())
+        return f"{entry.gymnasium_id} ({packages})"
 
 
 class Adapted:
-    """What the adapter needs of Gymnasium's interface, for an environment that is none of Gymnasium's."""
+    """The adapter's part of Gymnasium's interface, for an environment of another one. `raw`: the environment to which
+    it leaves its steps and pictures, if it has one."""
 
-    metadata = {"render_modes": ["rgb_array"]}
-    spec = None
+    metadata: Mapping[str, Any] = {"render_modes": ["rgb_array"]}
+    spec: Any = None
+    raw: Any = None
 
     @property
     def unwrapped(self) -> Any:
         return self
 
+    def step(self, action: Any) -> Any:
+        return self.raw.step(action)
+
+    def render(self) -> Any:
+        return self.raw.render()
+
     def close(self) -> None:
         """Frees what it holds."""
+        if self.raw is not None:
+            self.raw.close()
 
 
 class GymnasiumEnvironment(Environment):
@@ -193,17 +203,15 @@ class GymnasiumEnvironment(Environment):
         self._observe = compile_observation(obs_schema)
         self._encode = converter(self.bare.observation_space, family.encoding, back=False)
         self._decode = converter(self.bare.action_space, family.encoding, back=True)
-        self._promises: trial.Promises | None = None
-        if not is_shipped(entry.id):
-            self._promises = trial.Promises(obs_schema, action_schema, self._schema, entry.success)
+        self._promises = None if is_shipped(entry.id) else trial.Promises(self._schema, entry.success)
         self.action_codec = compile_actions(action_schema)
-        components = entry.reward_components or family.components.get(entry.gymnasium_id or "", {})
+        components: Mapping[str, str] = entry.reward_components
         self._rewards = rewards.Scalarisation.of(entry, self.bare)
         if self._rewards is not None:
             components = self._rewards.texts(components)
         words, spec = family.words(entry, self.bare), self.bare.spec
         about = About(entry, self.bare, obs_schema, action_schema, components, self._limit, words)
-        made = {"gymnasium_id": entry.gymnasium_id, "kwargs": entry.kwargs}
+        made: dict[str, Any] = {"gymnasium_id": entry.gymnasium_id, "kwargs": entry.kwargs}
         made["wrappers"] = [{"wrapper": each.wrapper, "kwargs": each.kwargs} for each in entry.wrappers]
         self.solved_by = family.solved_by.get(entry.gymnasium_id or "", "")
         self.description = EnvironmentDescription(
@@ -312,9 +320,9 @@ class GymnasiumEnvironment(Environment):
             if is_shipped(entry.id) or isinstance(error, EvopolicyError):
                 raise
             where = f"kwargs {entry.kwargs} of its file" if entry.kwargs else "its gymnasium_id"
+            made = f"{call}: gymnasium.make({entry.gymnasium_id!r})"
             raise WorkerError(
-                f"{call}: gymnasium.make({entry.gymnasium_id!r}) raised {described(error)}; correct {where}, or the"
-                " environment"
+                f"{made} raised {described(error)}; correct {where}, or the environment"
             ) from error
         limits = [entry.max_episode_steps]
         while type(env).__name__ in _PLAIN_WRAPPERS:
@@ -327,18 +335,19 @@ class GymnasiumEnvironment(Environment):
         elif self._accelerate and not entry.kwargs:
             self.accelerations = tuple(accelerate(str(entry.gymnasium_id), env))
         for wrapper in entry.wrappers:
-            env = wrapped(entry.id, env, wrapper)
+            env = _wrapped(entry.id, env, wrapper)
         self.bare = env
 
     def _multiply(self, env: gymnasium.Env[Any, Any]) -> None:
         for name, quantities in self._family.parameters(env).items():
             for owner, attribute in quantities:
                 value, factor = getattr(owner, attribute), self._factors.get(name, 1.0)
-                if isinstance(value, np.ndarray):
+                if isinstance(value, list):
+                    setattr(owner, attribute, [each * factor for each in value])
+                elif isinstance(value, np.ndarray):
                     value *= factor  # MuJoCo's arrays are views of its model.
                 else:
-                    many = isinstance(value, list)
-                    setattr(owner, attribute, [each * factor for each in value] if many else value * factor)
+                    setattr(owner, attribute, value * factor)
         self._family.altered(env)
 
     def _schema(self, name: str) -> SpaceSchema:
@@ -353,6 +362,32 @@ class GymnasiumEnvironment(Environment):
         if self._promises is not None:
             self._promises.strict = True
         trial.play(self)
+
+
+def _wrapped(env_id: str, env: gymnasium.Env[Any, Any], wrapper: Wrapper) -> gymnasium.Env[Any, Any]:
+    """`env` in that wrapper. Raises WorkerError, naming environment and wrapper, when the wrapper is unknown or cannot
+    be applied with its arguments."""
+    where = f"environment {env_id}, wrapper {wrapper.wrapper!r}"
+    path, colon, name = wrapper.wrapper.rpartition(":")
+    try:
+        module = importlib.import_module(path if colon else "gymnasium.wrappers")
+        make = getattr(module, name)
+    except (ImportError, AttributeError, ValueError) as error:
+        near = [] if colon else difflib.get_close_matches(name, dir(module), n=3)
+        hint = f"near: {', '.join(near)}" if near else "say a class of gymnasium.wrappers, or module:Class"
+        raise WorkerError(f"{where}: no wrapper has this name; {hint}") from error
+    except Exception as error:
+        raise WorkerError(
+            f"{where}: its module {path!r} raised {type(error).__name__}: {error} on import; correct the module"
+        ) from error
+    try:
+        made: gymnasium.Env[Any, Any] = make(env, **wrapper.kwargs)
+    except Exception as error:
+        raise WorkerError(
+            f"{where}, kwargs {wrapper.kwargs}: it cannot be put around the environment: {type(error).__name__}:"
+            f" {error}"
+        ) from error
+    return made
 
 
 @contextlib.contextmanager

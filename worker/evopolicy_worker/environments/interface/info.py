@@ -55,7 +55,8 @@ def _compound(value: Any) -> Any:
 
 
 def _scalar(value: Any) -> Any:
-    return _SCALARS.get(type(value), lambda _: None)(value)
+    convert = _SCALARS.get(type(value))
+    return None if convert is None else convert(value)
 
 
 @lru_cache(maxsize=4096)

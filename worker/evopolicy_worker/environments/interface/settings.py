@@ -11,10 +11,7 @@ from pathlib import Path
 
 _ALWAYS = {
     # One slot has one core; and the order of summation in a threaded BLAS depends on the number of threads.
-    "OMP_NUM_THREADS": "1",
-    "OPENBLAS_NUM_THREADS": "1",
-    "MKL_NUM_THREADS": "1",
-    "NUMEXPR_NUM_THREADS": "1",
+    **{f"{name}_NUM_THREADS": "1" for name in ("OMP", "OPENBLAS", "MKL", "NUMEXPR")},
     # "dummy" makes the frames of highway-env black; "offscreen" draws, and needs no display either.
     "SDL_VIDEODRIVER": "offscreen",
     "SDL_AUDIODRIVER": "dummy",

@@ -32,21 +32,15 @@ _ROUNDING = 1e-6
 class Promises:
     """Checks one environment after its calls. Raises WorkerError that names environment, call, field and remedy."""
 
-    def __init__(
-        self,
-        obs_space: SpaceSchema,
-        action_space: SpaceSchema,
-        schema_of: Callable[[str], SpaceSchema],
-        success: str = "",
-    ) -> None:
+    def __init__(self, schema_of: Callable[[str], SpaceSchema], success: str) -> None:
         """`schema_of`: the environment's present `observation_space` or `action_space`. `success`: the key in
         `info`."""
         self._schema_of = schema_of
         self._success = success
-        self.strict = False
-        """Whether values beyond bounds, and a success that is no truth value, are refused, too."""
-        self._reported = False
-        self._spaces = {"observation_space": obs_space, "action_space": action_space}
+        self.strict = self._reported = False
+        """`strict`: whether values beyond bounds, and a success that is no truth value, are refused, too."""
+        self._spaces = {name: schema_of(name) for name in ("observation_space", "action_space")}
+        obs_space = self._spaces["observation_space"]
         self._outside = spaces.compile_checker(obs_space)
         self._far_outside = spaces.compile_checker(_widened(obs_space))
 
@@ -122,8 +116,7 @@ def _altered(obs: Any, raw: Any) -> str:
     if not isinstance(obs, np.ndarray) or obs.dtype.kind == "f":
         return ""
     given = np.asarray(raw).reshape(obs.shape)
-    wrong = np.argwhere(given != obs) if given.dtype != obs.dtype else ()
-    if not len(wrong):
+    if given.dtype == obs.dtype or not len(wrong := np.argwhere(given != obs)):
         return ""
     where = tuple(wrong[0].tolist())
     return f"element {where} is {given[where]}, which {obs.dtype} does not have"

@@ -7,15 +7,14 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
-import numpy as np
 
 from evopolicy_common.catalogue.worlds import KEY, OPTION
 from evopolicy_common.errors import WorkerError
 from evopolicy_common.messages.environment import Case
 from evopolicy_common.worlds import rules
 from evopolicy_common.worlds.rules import FACTORS, PUBLIC, Rules, kinds, text
-from evopolicy_worker.environments.interface.adapters import adapter
 from evopolicy_worker.environments.interface.base import Environment, Frame, Observation, Step
+from evopolicy_worker.environments.interface.fingerprint import adapter
 
 _CODE = hashlib.sha256(Path(rules.__file__).read_bytes()).hexdigest()[:12]
 
@@ -62,9 +61,6 @@ class World(Environment):
         rules = self._rules[1]
         step = self._base.step(rules.act(action))
         return step._replace(obs=rules.observe(step.obs))
-
-    def draw(self, rng: np.random.Generator, obs: Observation) -> Any:
-        return self.action_codec.sample(rng)
 
     def render(self) -> Frame:
         return self._base.render()

@@ -5,20 +5,16 @@ from __future__ import annotations
 from typing import Any
 
 _FINGERS = {"FF": "forefinger", "MF": "middle finger", "RF": "ring finger", "LF": "little finger"}
-_BENDS = {
-    "4": "its bone in the palm",
-    "3": "knuckle, sideways",
-    "2": "knuckle, bent",
-    "1": "middle joint, bent",
-}
-_BENDS |= {"0": "last joint, bent"}
+_BENDS = (
+    "last joint, bent",
+    "middle joint, bent",
+    "knuckle, bent",
+    "knuckle, sideways",
+    "its bone in the palm",
+)
 _JOINTS = {
-    "ARTx": "arm, moved along x",
-    "ARTy": "arm, moved along y",
-    "ARTz": "arm, moved along z",
-    "ARRx": "arm, turned about x",
-    "ARRy": "arm, turned about y",
-    "ARRz": "arm, turned about z",
+    **{f"ART{axis}": f"arm, moved along {axis}" for axis in "xyz"},
+    **{f"ARR{axis}": f"arm, turned about {axis}" for axis in "xyz"},
     "WRJ1": "wrist, sideways",
     "WRJ0": "wrist, bent",
     "THJ4": "thumb: base, turned",
@@ -26,7 +22,7 @@ _JOINTS = {
     "THJ2": "thumb: middle joint, first axis",
     "THJ1": "thumb: middle joint, second axis",
     "THJ0": "thumb: last joint; negative bends",
-} | {f"{short}J{k}": f"{name}: {bend}" for short, name in _FINGERS.items() for k, bend in _BENDS.items()}
+} | {f"{short}J{k}": f"{name}: {bend}" for short, name in _FINGERS.items() for k, bend in enumerate(_BENDS)}
 
 
 def words(gymnasium_id: str, env: Any) -> dict[str, str]:

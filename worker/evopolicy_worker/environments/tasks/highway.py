@@ -1,4 +1,4 @@
-"""What HighwayEnv's configuration tells: the tables of observation and action, with their scales. The rest is in
+"""The tables of observation and action, with their scales, from HighwayEnv's configuration. The other texts are in
 family_highway.toml.
 """
 
@@ -6,21 +6,24 @@ from __future__ import annotations
 
 from typing import Any
 
+_SCALED = "−1 to 1"
 _FEATURES = {
-    "presence": ("1 where the row holds a car, else 0", "flag"),
-    "x": ("x", "m"),
-    "y": ("y", "m"),
-    "vx": ("velocity along x", "m/s"),
-    "vy": ("velocity along y", "m/s"),
-    "cos_h": ("cosine of the heading, measured from the x axis towards the y axis", "–"),
-    "sin_h": ("sine of the heading", "–"),
-    "long_off": ("distance of the car from its lane's beginning, along the lane", "m"),
-    "lat_off": ("distance of the car from its lane's middle, sideways; positive to the right", "m"),
-    "ang_off": ("heading relative to the lane", "rad"),
+    "presence": ("1 where the row holds a car, else 0", "flag", "0, 1"),
+    "x": ("x", "m", _SCALED),
+    "y": ("y", "m", _SCALED),
+    "vx": ("velocity along x", "m/s", _SCALED),
+    "vy": ("velocity along y", "m/s", _SCALED),
+    "cos_h": ("cosine of the heading, measured from the x axis towards the y axis", "–", _SCALED),
+    "sin_h": ("sine of the heading", "–", _SCALED),
+    "long_off": ("distance of the car from its lane's beginning, along the lane", "m", "0 to 500"),
+    "lat_off": (
+        "distance of the car from its lane's middle, sideways; positive to the right",
+        "m",
+        "about ±10",
+    ),
+    "ang_off": ("heading relative to the lane", "rad", "−π to π"),
 }
-"""What a feature of a row means, and its unit."""
-_BARE = {"presence": "0, 1", "long_off": "0 to 500", "ang_off": "−π to π", "lat_off": "about ±10"}
-"""Ranges of features that are not scaled; those of other features are −1 to 1."""
+"""What a feature of a row means, its unit, and its range where it is not scaled."""
 _CHOICES = {
     "LANE_LEFT": "change to the lane on the left, if there is one within reach",
     "IDLE": "keep lane and chosen speed",
@@ -32,10 +35,10 @@ _CHOICES = {
 
 def words(env: Any) -> dict[str, str]:
     """Sections of the task text of an environment of HighwayEnv."""
-    found = {"Observation": _observed(env), "Action": _acted(env)}
+    sections = {"Observation": _observed(env), "Action": _acted(env)}
     if env.config.get("neighbour_vehicles_connected_lanes"):
-        found["Start"] = "The other drivers also watch the cars on lanes that join theirs."
-    return found
+        sections["Start"] = "The other drivers also watch the cars on lanes that join theirs."
+    return sections
 
 
 def _observed(env: Any) -> str:
@@ -61,47 +64,41 @@ def _observed(env: Any) -> str:
         return "\n".join((text, "", *rows))
     if hasattr(of, "horizon"):
         steps = f"0–2, 0–{of.horizon * env.config['policy_frequency'] - 1}"
-        return "\n".join(
-            (
-                (
-                    "Predicted collisions, if all cars keep their speeds. First index: your speed, 0 the choice below"
-                    " the present one, 1 the present choice, 2 the one above (at the lowest and highest the same"
-                    " again). Second: the lane, 0 the one on the left, 1 your own, 2 the one on the right; a lane that"
-                    " does not exist is all 1. Third: after how many seconds."
-                ),
-                "",
-                f"| 0, {steps} | collision at a lower speed | share | 0 none, 0.5 close, 1 certain |",
-                f"| 1, {steps} | collision at the present speed | share | 0 none, 0.5 close, 1 certain |",
-                f"| 2, {steps} | collision at a higher speed | share | 0 none, 0.5 close, 1 certain |",
-            )
+        text = (
+            "Predicted collisions, if all cars keep their speeds. First index: your speed, 0 the choice below the"
+            " present one, 1 the present choice, 2 the one above (at the lowest and highest the same again). Second:"
+            " the lane, 0 the one on the left, 1 your own, 2 the one on the right; a lane that does not exist is all 1."
+            " Third: after how many seconds."
         )
-    if hasattr(of, "grid_step"):
-        (ahead, across), (low, _) = of.grid.shape[1:], of.grid_size[0]
-        cells = f"0–{ahead - 1}, 0–{across - 1}"
-        return "\n".join(
-            (
-                (
-                    f"A grid of cells of {of.grid_step[0]:g} × {of.grid_step[1]:g} m around your car, which turns with"
-                    f" it. Second index: along your heading, from {-low:g} m behind to as far ahead. Third: sideways,"
-                    f" from {-low:g} m to the left to as far to the right. Your car is in the cell {ahead // 2},"
-                    f" {across // 2}."
-                ),
-                "",
-                f"| 0, {cells} | a car, your own too, has its middle in the cell | flag | 0, 1 |",
-                f"| 1, {cells} | the middle of a lane passes through the cell | flag | 0, 1 |",
-            )
+        rows = [
+            f"| {k}, {steps} | collision at {speed} speed | share | 0 none, 0.5 close, 1 certain |"
+            for k, speed in enumerate(("a lower", "the present", "a higher"))
+        ]
+        return "\n".join((text, "", *rows))
+    if not hasattr(of, "grid_step"):
+        return ""
+    (ahead, across), (low, _) = of.grid.shape[1:], of.grid_size[0]
+    cells = f"0–{ahead - 1}, 0–{across - 1}"
+    text = (
+        f"A grid of cells of {of.grid_step[0]:g} × {of.grid_step[1]:g} m around your car, which turns with it. Second"
+        f" index: along your heading, from {-low:g} m behind to as far ahead. Third: sideways, from {-low:g} m to the"
+        f" left to as far to the right. Your car is in the cell {ahead // 2}, {across // 2}."
+    )
+    return "\n".join(
+        (
+            *(text, ""),
+            f"| 0, {cells} | a car, your own too, has its middle in the cell | flag | 0, 1 |",
+            f"| 1, {cells} | the middle of a lane passes through the cell | flag | 0, 1 |",
         )
-    return ""
+    )
 
 
 def _feature(kind: Any, name: str, place: str, owner: str) -> str:
-    meaning, unit = _FEATURES[name]
+    meaning, unit, reach = _FEATURES[name]
     if kind.normalize and name in kind.features_range:
         high = kind.features_range[name][1]
         meaning, unit = f"{meaning} ÷ {high:g}", f"{high:g} {unit}"
-        reach = "−1 to 1" if kind.clip else "about −1 to 1, not clipped"
-    else:
-        reach = _BARE.get(name, "−1 to 1")
+        reach = _SCALED if kind.clip else "about −1 to 1, not clipped"
     return f"| {place} | {owner}{meaning} | {unit} | {reach} |"
 
 
@@ -113,23 +110,16 @@ def _acted(env: Any) -> str:
     each = f"Steps per second: {config['policy_frequency']}."
     if hasattr(of, "target_speeds"):
         speeds = ", ".join(f"{speed:g}" for speed in of.target_speeds)
-        told = (
+        about = (
             f"A built-in driver steers along your lane and route, and approaches the speed that you choose: {speeds}"
             f" m/s. {each}"
         )
-        if parts:
-            meant = "; ".join(f"{k} {_CHOICES[name]}" for k, name in of.actions.items())
-            return (
-                f"{told}\n\n| 0–{len(parts) - 1} | the choice for that car: {meant} | choice | 0 to"
-                f" {len(of.actions) - 1} |"
-            )
-        return "\n".join((told, "", *(f"| {k} | {_CHOICES[name]} |" for k, name in of.actions.items())))
-    rows = ["acceleration; negative brakes, then reverses"] * of.longitudinal
-    rows += ["steering angle; positive turns the heading from x towards y, to the right"] * of.lateral
-    return "\n".join(
-        (
-            each,
-            "",
-            *(f"| {k} | {meaning} | share of the largest | −1 to 1 |" for k, meaning in enumerate(rows)),
-        )
-    )
+        if not parts:
+            return "\n".join((about, "", *(f"| {k} | {_CHOICES[name]} |" for k, name in of.actions.items())))
+        choices = "; ".join(f"{k} {_CHOICES[name]}" for k, name in of.actions.items())
+        row = f"| 0–{len(parts) - 1} | the choice for that car: {choices} | choice | 0 to {len(of.actions) - 1} |"
+        return f"{about}\n\n{row}"
+    meanings = ["acceleration; negative brakes, then reverses"] * of.longitudinal
+    meanings += ["steering angle; positive turns the heading from x towards y, to the right"] * of.lateral
+    rows = (f"| {k} | {meaning} | share of the largest | −1 to 1 |" for k, meaning in enumerate(meanings))
+    return "\n".join((each, "", *rows))

@@ -53,8 +53,11 @@ def text(about: About) -> str:
     For a shipped environment, the documentation is reduced to words, without formulas and constants of its dynamics.
     """
     entry, env, obs_space, action_space, components, limit, _ = about
+    rewards = reward_table(
+        components, vector=bool(entry.reward_vector) or hasattr(env.unwrapped, "reward_space")
+    )
     if is_shipped(entry.id):
-        return _in_sections(about)
+        return _in_sections(about, rewards if components else _REWARD)
     documentation = _documentation(env)
     parts = [
         f"# {entry.label}",
@@ -62,10 +65,7 @@ def text(about: About) -> str:
         *([documentation] if documentation else []),
         "## Observation\n\n" + _space(obs_space),
         "## Action\n\n" + _space(action_space),
-        "## Reward\n\n"
-        + reward_table(
-            components, vector=bool(entry.reward_vector) or hasattr(env.unwrapped, "reward_space")
-        ),
+        "## Reward\n\n" + rewards,
         "## Start\n\nThe start of an episode is drawn from its seed.",
         f"## End\n\nAn episode ends when the environment ends it (`terminated`), and after {limit:,} steps at the"
         " latest (`truncated`)." + _success(entry),
@@ -73,33 +73,29 @@ def text(about: About) -> str:
     return "\n\n".join(parts) + "\n"
 
 
-def _in_sections(about: About) -> str:
-    """The sections that are written for the family, its groups of environments, and by it."""
-    entry, env, obs_space, action_space, components, limit, own = about
-    found = {**_sections(_family_text(entry.family)), **own}
+def _in_sections(about: About, rewards: str) -> str:
+    """The sections that are written for the family, its groups of environments, and by it. `rewards`: where none of
+    them has a text of these."""
+    entry, env, obs_space, action_space, _, limit, own = about
     grouped = _of_groups(entry, own)
-    found |= grouped
-    acted = found.get("Action", "")
+    written = {**_sections(_family_text(entry.family)), **own, **grouped}
+    acted = written.get("Action", "")
     # A table that a family writes covers a space of one part.
     listed = "|" in acted and action_space["type"] in ("Box", "Discrete", "MultiBinary")
     actions = "" if grouped or listed else "\n\n" + _space(action_space)
-    end = f"{found.get('End', '')} Truncated after {limit} steps.".strip()
+    end = f"{written.get('End', '')} Truncated after {limit} steps.".strip()
     success = _success(entry)
-    if not success and "uccess" not in end + found.get("Reward", ""):
+    if not success and "uccess" not in end + written.get("Reward", ""):
         success = " Nothing but the return tells success."
-    rewards = reward_table(
-        components, vector=bool(entry.reward_vector) or hasattr(env.unwrapped, "reward_space")
-    )
+    observed = written.get("Observation", _space(obs_space)) + _maze(env)
     parts = [
         f"# {entry.label}",
         "Maximise the sum of the rewards of an episode.",
-        found.get("", ""),
-        f"## Observation\n\n{_form(obs_space) if grouped else ''}"
-        + found.get("Observation", _space(obs_space))
-        + _maze(env),
-        f"## Action\n\n{_form(action_space) if grouped or listed else ''}" + acted + actions,
-        "## Reward\n\n" + found.get("Reward", rewards if components else _REWARD),
-        "## Start\n\n" + found.get("Start", "The start of an episode is drawn from its seed."),
+        written.get("", ""),
+        f"## Observation\n\n{_form(obs_space) if grouped else ''}{observed}",
+        f"## Action\n\n{_form(action_space) if grouped or listed else ''}{acted}{actions}",
+        "## Reward\n\n" + written.get("Reward", rewards),
+        "## Start\n\n" + written.get("Start", "The start of an episode is drawn from its seed."),
         "## End\n\n" + end + success,
     ]
     return "\n\n".join(part for part in parts if part) + "\n"
@@ -107,10 +103,10 @@ def _in_sections(about: About) -> str:
 
 def _form(space: SpaceSchema) -> str:
     """The kind of a space, with shapes and dtypes."""
-    named = [(name, _kind(leaf)) for name, leaf in _leaves(space, "")]
+    kinds = {name: _kind(leaf) for name, leaf in _leaves(space, "")}
     if space["type"] in ("Dict", "Tuple"):
-        return f"`{space['type']}` of {', '.join(f'`{name}` ({kind})' for name, kind in named)}.\n\n"
-    return f"{named[0][1]}.\n\n"
+        return f"`{space['type']}` of {', '.join(f'`{name}` ({kind})' for name, kind in kinds.items())}.\n\n"
+    return f"{kinds['']}.\n\n"
 
 
 def _kind(leaf: SpaceSchema) -> str:
@@ -123,9 +119,9 @@ def _kind(leaf: SpaceSchema) -> str:
 def groups(family: str) -> tuple[dict[str, Any], ...]:
     """The groups of a family's file, below those of the files that it extends."""
     name = f"family_{family}.toml"
-    found = tomllib.loads(read(name)) if files(__package__).joinpath(name).is_file() else {}
-    extended = [group for each in found.get("extends", ()) for group in groups(each)]
-    return (*extended, *found.get("text", ()))
+    tables = load(name) if files(__package__).joinpath(name).is_file() else {}
+    extended = [group for each in tables.get("extends", ()) for group in groups(each)]
+    return (*extended, *tables.get("text", ()))
 
 
 def _of_groups(entry: Entry, own: Mapping[str, str]) -> dict[str, str]:
@@ -141,15 +137,15 @@ def _of_groups(entry: Entry, own: Mapping[str, str]) -> dict[str, str]:
         for each in groups(entry.family)
         if _fits(entry, each["ids"]) and not _fits(entry, each.get("except", ()))
     ]
-    found: dict[str, list[str]] = {name: [text] for name, text in own.items()} if chosen else {}
+    texts: dict[str, list[str]] = {name: [text] for name, text in own.items()} if chosen else {}
     for group in chosen:
         whole = _sections(read(f"{group['like']}.md")) if "like" in group else {}
-        left_out = ("End", *group.get("without", ()))
-        sections = {name: text for name, text in whole.items() if name not in left_out}
+        without = ("End", *group.get("without", ()))
+        sections = {name: text for name, text in whole.items() if name not in without}
         for name, text in (*sections.items(), ("", group.get("about", "")), *group.items()):
             if isinstance(text, str) and text and name in ("", *_HEADINGS):
-                found.setdefault(name, []).append(_placed(text, group.get("within", "")))
-    return {name: _joined(texts, name) for name, texts in found.items()}
+                texts.setdefault(name, []).append(_placed(text, group.get("within", "")))
+    return {name: _joined(each, name) for name, each in texts.items()}
 
 
 def _fits(entry: Entry, patterns: Iterable[str]) -> bool:
@@ -165,29 +161,32 @@ def _joined(texts: list[str], section: str) -> str:
     """The texts as one, those of observation and action with one table."""
     if section not in ("Observation", "Action"):
         return "\n\n".join(each.strip() for each in texts)
+    heads = (_COMPONENTS, *_HEADS.values())
     before, rows, after = [], [], []
     for text in texts:
-        head, bar, rest = f"\n{text.strip()}".partition("\n|")
-        before.append(head.strip())
+        prose, bar, rest = f"\n{text.strip()}".partition("\n|")
+        before.append(prose.strip())
         lines = f"|{rest}".splitlines() if bar else []
-        rows += [
-            each for each in lines if each.startswith("|") and each not in (_COMPONENTS, *_HEADS.values())
-        ]
+        rows += [each for each in lines if each[:1] == "|" and each[:4] != "|---" and each not in heads]
         after.append("\n".join(each for each in lines if not each.startswith("|")).strip())
-    rows = [each for each in rows if not each.startswith("|---")]
     table = ""
     if rows:
         width = rows[0].count("|") - 1
         head = _COMPONENTS if section == "Observation" else _HEADS[width]
         table = "\n".join((head, "|---" * width + "|", *rows))
-    prose = [*before, *after] if not rows else [*before, table, *after]
-    return "\n\n".join(each for each in prose if each)
+    return "\n\n".join(filter(None, (*before, table, *after)))
 
 
 def _family_text(family: str) -> str:
     """The text written for all environments of a family; empty when there is none."""
     name = f"family_{family}.md"
     return read(name) if files(__package__).joinpath(name).is_file() else ""
+
+
+@cache
+def load(name: str) -> dict[str, Any]:
+    """The tables of a TOML file of this folder."""
+    return tomllib.loads(read(name))
 
 
 def read(name: str) -> str:
@@ -240,11 +239,12 @@ def _space(space: SpaceSchema) -> str:
 
 def _leaves(space: SpaceSchema, name: str) -> list[tuple[str, SpaceSchema]]:
     if space["type"] == "Dict":
-        named = [(f"{name}.{key}" if name else str(key), part) for key, part in space["spaces"].items()]
-        return [leaf for key, part in named for leaf in _leaves(part, key)]
-    if space["type"] == "Tuple":
-        return [leaf for k, part in enumerate(space["spaces"]) for leaf in _leaves(part, f"{name}[{k}]")]
-    return [(name, space)]
+        parts = {f"{name}.{key}" if name else str(key): part for key, part in space["spaces"].items()}
+    elif space["type"] == "Tuple":
+        parts = {f"{name}[{k}]": part for k, part in enumerate(space["spaces"])}
+    else:
+        return [(name, space)]
+    return [leaf for key, part in parts.items() for leaf in _leaves(part, key)]
 
 
 def words(space: SpaceSchema) -> str:
@@ -254,8 +254,7 @@ def words(space: SpaceSchema) -> str:
         first = int(space.get("start", 0))
         return f"an integer from {first} to {first + int(space['n']) - 1}"
     if kind == "Image":
-        height, width, channels = space["shape"]
-        return f"a picture, {height} × {width} × {channels}, uint8 from 0 to 255"
+        return f"a picture, {' × '.join(map(str, space['shape']))}, uint8 from 0 to 255"
     if kind == "Box":
         return f"{_shape(space['shape'])} of {space['dtype']}, {_range(space['low'], space['high'])}"
     if kind == "MultiDiscrete":
@@ -266,17 +265,14 @@ def words(space: SpaceSchema) -> str:
         return f"a text of {space['min_length']} to {space['max_length']} characters"
     if kind == "Sequence":
         return f"any number of items, each {words(space['space'])}"
-    if kind == "OneOf":
-        return "a pair of an index and a value: " + "; ".join(
-            f"{k}: {words(part)}" for k, part in enumerate(space["spaces"])
-        )
     if kind == "Graph":
-        edges = (
-            "no values on edges" if space["edge_space"] is None else f"each edge {words(space['edge_space'])}"
-        )
+        edge = space["edge_space"]
+        edges = "no values on edges" if edge is None else f"each edge {words(edge)}"
         return f"a graph as `nodes`, `edges`, `edge_links`: each node {words(space['node_space'])}; {edges}"
-    inner = space["spaces"].values() if kind == "Dict" else space["spaces"]
-    return "(" + ", ".join(map(words, inner)) + ")"
+    parts = list(map(words, space["spaces"].values() if kind == "Dict" else space["spaces"]))
+    if kind == "OneOf":
+        return "a pair of an index and a value: " + "; ".join(f"{k}: {part}" for k, part in enumerate(parts))
+    return f"({', '.join(parts)})"
 
 
 def _shape(shape: list[int]) -> str:
@@ -287,17 +283,14 @@ def _range(low: Any, high: Any) -> str:
     lowest, highest = _edge(low, min), _edge(high, max)
     if math.isinf(lowest) and math.isinf(highest):
         return "without bounds"
-    return f"from {lowest:g} to {highest:g}" + (
-        "" if low == lowest and high == highest else " or narrower by element"
-    )
+    shared = low == lowest and high == highest
+    return f"from {lowest:g} to {highest:g}{'' if shared else ' or narrower by element'}"
 
 
 def _edge(values: Any, pick: Any) -> float:
-    return (
-        float(pick(_edge(each, pick) for each in values))
-        if isinstance(values, list) and values
-        else float(values or 0)
-    )
+    if isinstance(values, list) and values:
+        return float(pick(_edge(each, pick) for each in values))
+    return float(values or 0)
 
 
 def reward_table(components: Mapping[str, str], *, vector: bool) -> str:
