@@ -37,7 +37,8 @@ class MiniWorldFamily(GymnasiumFamily):
 
     def make(self, entry: Entry, *, render: bool) -> Any:
         """As others; observations are drawn, so WorkerError where the host has no EGL."""
-        check_rendering(entry, render=True, verb="draws its observations")
+        fault = "draws its observations with EGL, which is not installed"
+        check_rendering(entry, render=True, fault=fault)
         import gymnasium
 
         assert entry.gymnasium_id is not None

@@ -46,12 +46,12 @@ class MujocoFamily(GymnasiumFamily):
         mujoco.mj_setConst(bare.model, bare.data)
 
 
-def check_rendering(entry: Entry, *, render: bool, verb: str = "renders") -> None:
+def check_rendering(
+    entry: Entry, *, render: bool, fault: str = "renders with EGL, which is not installed"
+) -> None:
     """Raises WorkerError when an image is requested and the host has no EGL to render it."""
     if render and find_library("EGL") is None:
-        raise WorkerError(
-            f"{entry.id} {verb} with EGL, which is not installed: {distribution.install('egl')}"
-        )
+        raise WorkerError(f"{entry.id} {fault}: {distribution.install('egl')}")
 
 
 FAMILY = MujocoFamily()
