@@ -38,8 +38,8 @@ N_CASES = 32
 def policies() -> dict[str, Path]:
     """The folder of each environment's policy, Core16 first."""
     core16 = catalogue.suites()["core16"].environments
-    found = {env_id: catalogue.policy_folder(POLICIES, env_id) for env_id in core16}
-    return found | {each.env: each.policy for each in proofs.table()}
+    folders = {env_id: catalogue.policy_folder(POLICIES, env_id) for env_id in core16}
+    return folders | {each.env: each.policy for each in proofs.table()}
 
 
 def cases(env_id: str) -> list[int]:
@@ -79,9 +79,9 @@ def measure(env_id: str, folder: Path) -> Anchor:
     return Anchor(random=measured(random), best=measured(best), cases=N_CASES, policy=where)
 
 
-def write(env_id: str, found: Anchor) -> None:
+def write(env_id: str, anchor: Anchor) -> None:
     """Adds or replaces one anchor, in the order of `policies`."""
-    known = msgspec.json.decode(FILE.read_bytes(), type=dict[str, Anchor]) | {env_id: found}
+    known = msgspec.json.decode(FILE.read_bytes(), type=dict[str, Anchor]) | {env_id: anchor}
     ordered = {each: known[each] for each in policies() if each in known}
     FILE.write_bytes(msgspec.json.format(msgspec.json.encode(ordered), indent=1) + b"\n")
 
@@ -109,9 +109,9 @@ def written(page: str) -> str:
 def main(ids: list[str]) -> None:
     divided = installs.divided(ids)
     for env_id in divided.pop(sys.executable, []):
-        found = measure(env_id, policies()[env_id])
-        write(env_id, found)
-        print(env_id, found.random.mean, found.best.mean, flush=True)
+        anchor = measure(env_id, policies()[env_id])
+        write(env_id, anchor)
+        print(env_id, anchor.random.mean, anchor.best.mean, flush=True)
     for python, elsewhere in divided.items():
         subprocess.run([python, __file__, *elsewhere], check=True)
     anchors.anchors.cache_clear()

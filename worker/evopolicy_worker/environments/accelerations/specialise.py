@@ -22,7 +22,7 @@ def specialised(cls: Any, mixin: Any) -> Any:
         return type(cls.__name__, (mixin, cls), names)
     # An object's class is exchanged for one of the same memory layout, which the first base determines.
     order = [each for each in mixin.__mro__ if each not in cls.__mro__] + list(cls.__mro__)
-    kind = type("Ordered", (type(cls),), {"mro": lambda found: [found, *order]})
+    kind = type("Ordered", (type(cls),), {"mro": lambda made: [made, *order]})
     return kind(cls.__name__, (cls,), names)
 
 

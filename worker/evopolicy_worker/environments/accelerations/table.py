@@ -54,7 +54,7 @@ class Acceleration:
     def fault(self) -> tuple[str, dict[str, str]]:
         """Why it may not be used here, and the installed versions that are not proved; an empty text when it may."""
         installed = {name: _version(name) for name in self.distributions}
-        unproved = {name: found for name, found in installed.items() if found not in PROVED[name]}
+        unproved = {name: own for name, own in installed.items() if own not in PROVED[name]}
         if unproved:
             return "not proved with the installed version", unproved
         return "" if not self.checks or self.module().holds() else "not exact on this machine", {}

@@ -26,8 +26,8 @@ class ClassicFamily(GymnasiumFamily):
         bare = env.unwrapped
         # An acceleration's class is derived from the library's.
         known = [_PARAMETERS[each.__name__] for each in type(bare).__mro__ if each.__name__ in _PARAMETERS]
-        found = known[0] if known else {}
-        return {name: [(bare, each) for each in attributes] for name, attributes in found.items()}
+        attributes_of = known[0] if known else {}
+        return {name: [(bare, each) for each in attributes] for name, attributes in attributes_of.items()}
 
 
 FAMILY = ClassicFamily()

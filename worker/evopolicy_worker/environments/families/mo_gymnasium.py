@@ -35,9 +35,9 @@ class MoGymnasiumFamily(MujocoFamily):
     def words(self, entry: Entry, env: Any) -> dict[str, str]:
         scalarisation = rewards.Scalarisation.of(entry, env)
         assert scalarisation is not None
-        found = highway.words(env.unwrapped) if "highway" in str(entry.gymnasium_id) else {}
+        sections = highway.words(env.unwrapped) if "highway" in str(entry.gymnasium_id) else {}
         components = scalarisation.texts(entry.reward_components)
-        return found | {"Reward": template.reward_table(components, vector=True)}
+        return sections | {"Reward": template.reward_table(components, vector=True)}
 
 
 class _MadeFromSeed(Adapted):

@@ -37,7 +37,7 @@ class MujocoFamily(GymnasiumFamily):
             "strength of the motors": [(model, "actuator_gear")],
             "friction of the surfaces": [(model, "geom_friction")] if touches else [],
         }
-        return {name: found for name, found in known.items() if any(getattr(*each).any() for each in found)}
+        return {name: owned for name, owned in known.items() if any(getattr(*each).any() for each in owned)}
 
     def altered(self, env: gymnasium.Env[Any, Any]) -> None:
         import mujoco

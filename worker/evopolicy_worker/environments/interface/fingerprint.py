@@ -90,8 +90,8 @@ def _digest(files: tuple[str, ...]) -> str:
 
 def versions(distributions: Iterable[str]) -> dict[str, str]:
     """Installed versions by lowercase name. Distributions that are not installed are left out."""
-    found = {name.lower(): _version(name) for name in distributions}
-    return {name: version for name, version in found.items() if version}
+    installed = {name.lower(): _version(name) for name in distributions}
+    return {name: version for name, version in installed.items() if version}
 
 
 @cache
@@ -104,7 +104,7 @@ def _version(name: str) -> str:
 
 
 def _matching(pattern: str) -> list[Path]:
-    found = sorted(path.resolve() for path in _ROOT.glob(pattern) if path.is_file())
-    if not found:
+    paths = sorted(path.resolve() for path in _ROOT.glob(pattern) if path.is_file())
+    if not paths:
         raise LookupError(f"no module of the adapters is called {pattern}")
-    return found
+    return paths
