@@ -206,13 +206,13 @@ def _cell(env: str, entry: str, sources: Sequence[Source]) -> Cell:
         runs.append(scores.RunReturns(score=score, returns=returns, case_set=cases))
     estimate = cell_mean(scores.Cell(entry=entry, env=env, runs=tuple(runs)))
     outcomes = [each.record.outcome for each in sources]
-    scores = [each.score for each in outcomes if each.score is not None]
+    measured = [each.score for each in outcomes if each.score is not None]
     random = [each.random_score for each in outcomes if each.random_score is not None]
     return Cell(
         entry=entry,
         env=env,
         runs=len(sources),
-        mean=mean(scores) if estimate else None,
+        mean=mean(measured) if estimate else None,
         low=estimate.low if estimate else None,
         high=estimate.high if estimate else None,
         over=estimate.reason or estimate.over if estimate else "a run has no score",
