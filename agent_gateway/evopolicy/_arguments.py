@@ -23,7 +23,7 @@ from evopolicy_common.messages.gateway import (
 )
 from evopolicy_gateway.declared import Declared, declared
 from evopolicy_gateway.run import run_options
-from evopolicy_gateway.run.options import limits_from
+from evopolicy_gateway.run.run_options import limits_from
 
 AnyPath = str | os.PathLike[str]
 

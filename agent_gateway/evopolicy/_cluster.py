@@ -35,8 +35,8 @@ from evopolicy_gateway.operator import cluster as operator
 from evopolicy_gateway.operator.trials import evaluation, policy_bundle
 from evopolicy_gateway.run import run_options
 from evopolicy_gateway.run.lifecycle import RunLifecycle
-from evopolicy_gateway.run.options import one_environment, packages_for
 from evopolicy_gateway.run.plan import Plan
+from evopolicy_gateway.run.run_options import one_environment, packages_for
 from evopolicy_gateway.run.watch import RunView
 from evopolicy_gateway.run_folder.listener import Listener
 

@@ -43,8 +43,8 @@ from evopolicy_gateway.agents.client import Client, ProtocolError, Refusal
 from evopolicy_gateway.harnesses.coding_agents import session
 from evopolicy_gateway.relay.usage import Usage
 from evopolicy_gateway.run.lifecycle import RunLifecycle
-from evopolicy_gateway.run.options import default_exp_id
 from evopolicy_gateway.run.plan import Plan
+from evopolicy_gateway.run.run_options import default_exp_id
 from evopolicy_gateway.run_folder import listener
 from evopolicy_gateway.run_folder.layout import RunFolder
 from evopolicy_gateway.run_folder.listener import Listener

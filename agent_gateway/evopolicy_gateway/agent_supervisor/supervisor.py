@@ -13,6 +13,7 @@ import signal
 import sys
 from collections.abc import Collection, Mapping
 from pathlib import Path
+from typing import Any
 
 import msgspec
 
@@ -22,7 +23,7 @@ from evopolicy_common.logs import structlog
 from evopolicy_common.records.secrets import Redaction, is_secret, note_passed, without_keys
 from evopolicy_gateway.harnesses import config_of, make
 from evopolicy_gateway.harnesses.interface.agent_config import AgentConfig
-from evopolicy_gateway.harnesses.interface.base import RelayAddress, Stage
+from evopolicy_gateway.harnesses.interface.base import Stage
 from evopolicy_gateway.inputs import kept as inputs
 from evopolicy_gateway.inputs import own_config
 from evopolicy_gateway.jail.jail import Jail
@@ -33,6 +34,7 @@ from evopolicy_gateway.processes.agent_process import environment_of
 from evopolicy_gateway.processes.child_messages import AgentEnded, Orders, StartAgent, emit
 from evopolicy_gateway.processes.clock import Activity, AgentClock
 from evopolicy_gateway.processes.resources import Resources
+from evopolicy_gateway.run_folder.layout import RunFolder
 from evopolicy_gateway.workspace.prompts import Prompts
 
 END_GRACE_S = 3.0
@@ -47,21 +49,23 @@ log: structlog.stdlib.BoundLogger = structlog.get_logger()
 
 
 async def keep(order: StartAgent, orders: Orders) -> AgentEnded:
-    """Runs the agent until it ends, is stopped, or its time is up; afterwards none of its processes is left."""
+    """Runs the agent until it ends, is stopped, or its time is up; afterwards none of its processes remains."""
     environment = environment_of({**order.urls, **order.variables})
     try:
-        config = config_of(order.agent, Path(order.started_in)) if order.config is None else None
+        if order.config is None:
+            config = config_of(order.agent, Path(order.started_in))
+        else:
+            config = msgspec.convert(order.config, AgentConfig)
     except ConfigError as error:
         # The agent's file has changed since the run was opened.
         return AgentEnded(reason="agent_failed", detail=str(error))
-    if order.config is not None:
-        config = msgspec.convert(order.config, AgentConfig)
     on_command_line: list[str] = []
     shown = without_keys([order.agent, msgspec.to_builtins(config)], on_command_line)[0]
     redact = Redaction.of(secrets_in(environment, config), order.urls).knowing(on_command_line)
-    agent_log = AgentLog(Path(order.agent_log), redact)
+    folder = RunFolder(Path(order.folder))
+    agent_log = AgentLog(folder.agent_log, redact)
     clock = AgentClock(order.wall_limit_s)
-    workspace, folders = Path(order.workspace), [Path(order.workspace)]
+    workspace, folders = folder.workspace, [folder.workspace]
     if order.jail is not None:
         folders += [Path(order.jail.private, name) for name in ("home", "tmp")]
     # Binds this process to cores, or makes the agent's cgroup.
@@ -75,7 +79,7 @@ async def keep(order: StartAgent, orders: Orders) -> AgentEnded:
         environment=environment,
         log=agent_log,
         on_turn=lambda turn, text: emit(messages.AgentTurn(turn=turn, text=text[:_TEXT_SHOWN])),
-        session_file=None if order.session_file is None else Path(order.session_file),
+        session_file=folder.session,
         on_doing=_tell,
         clock=clock,
         activity=activity,
@@ -83,16 +87,17 @@ async def keep(order: StartAgent, orders: Orders) -> AgentEnded:
         joins=resources.joins,
     )
     play = asyncio.create_task(_play(order, stage, config, resources))
-    stopped = asyncio.create_task(_stopped(orders, clock, activity))
-    late = asyncio.create_task(clock.run_out())
-    full = asyncio.create_task(resources.too_large())
+    ends: dict[str, asyncio.Task[Any]] = {
+        "told": asyncio.create_task(_stopped(orders, clock, activity)),
+        "wall_limit": asyncio.create_task(clock.run_out()),
+        "disk_limit": asyncio.create_task(resources.too_large()),
+    }
     telling = asyncio.create_task(_tell_use(clock, resources))
     log.info("agent started", agent=shown)
     try:
-        await asyncio.wait([play, stopped, late, full], return_when=asyncio.FIRST_COMPLETED)
-        ends = {"told": stopped, "wall_limit": late, "disk_limit": full}
+        await asyncio.wait([play, *ends.values()], return_when=asyncio.FIRST_COMPLETED)
         reason = None if play.done() else next(name for name, task in ends.items() if task.done())
-        detail = full.result() if reason == "disk_limit" else ""
+        detail = ends[reason].result() if reason == "disk_limit" else ""
         stage.over.set()
         await _until_gone(stage.started)
         # Once its programs have ended, a harness returns by itself with its facts (turns, tokens).
@@ -100,7 +105,7 @@ async def keep(order: StartAgent, orders: Orders) -> AgentEnded:
         play.cancel()
         ending = (await asyncio.gather(play, return_exceptions=True))[0]
     finally:
-        for task in (stopped, late, full, telling):
+        for task in (*ends.values(), telling):
             task.cancel()
         emit(messages.AgentUsed(used_s=clock.used_s(), resources=resources.used()))
         resources.remove()
@@ -124,10 +129,9 @@ async def _play(
     order: StartAgent, stage: Stage, config: AgentConfig | None, resources: Resources
 ) -> AgentEnded:
     harness = make(order.agent, Path(order.started_in), config)
-    urls, relayed = order.urls, bool(order.model_url)
-    if relayed:
-        harness.relay = RelayAddress(url=order.model_url, token=order.model_token)
-        urls = {**urls, "model": order.model_url}
+    urls, harness.relay = order.urls, order.relay
+    if order.relay is not None:
+        urls = {**urls, "model": order.relay.url}
     passed = [name for name in harness.variables if is_secret(name)]
     if order.jail is not None:
         passed += order.jail.settings.environment
@@ -145,7 +149,7 @@ async def _play(
             inputs=kept.shown(harness.skills_at),
             more_programs=[(server.command,) for server in kept.servers.values()],
             # With the relay it needs neither the provider's hosts nor the variables with the key.
-            harness="" if relayed else harness.name,
+            harness="" if order.relay else harness.name,
             command=harness.command,
             variables=harness.variables,
             hosts=harness.hosts,
@@ -158,17 +162,15 @@ async def _play(
         )
         inside = jail.environment(stage.environment, {**order.urls, **order.variables})
         stage = msgspec.structs.replace(stage, environment=inside, jail=jail)
-    if order.passed_file is not None:
-        written = [value for value in stage.log.redact.secrets if value in order.agent]
-        copied = own_config.secrets(harness.own_files) if order.jail is not None else ()
-        kept_secret = [*written, *copied, *(stage.environment.get(name, "") for name in passed)]
-        await asyncio.to_thread(note_passed, Path(order.passed_file), kept_secret)
+    written = [value for value in stage.log.redact.secrets if value in order.agent]
+    copied = own_config.secrets(harness.own_files) if order.jail is not None else ()
+    kept_secret = [*written, *copied, *(stage.environment.get(name, "") for name in passed)]
+    await asyncio.to_thread(note_passed, RunFolder(Path(order.folder)).passed, kept_secret)
     return await harness.play(stage)
 
 
 def secrets_in(environment: Mapping[str, str], config: AgentConfig | None) -> dict[str, str]:
-    """Variables whose values may be secrets; those that the agent's settings pass on always count, whatever their
-    names."""
+    """Variables whose values may be secrets, those that the agent's settings pass on included."""
     named = {} if config is None else {f"{name}_KEY": environment.get(name, "") for name in config.secret}
     return {**environment, **named}
 
@@ -179,25 +181,22 @@ def _tell(doing: messages.AgentDoing) -> None:
 
 
 async def _tell_use(clock: AgentClock, resources: Resources) -> None:
-    """Reports the used time and resources periodically, so that an agent that is killed and resumed gets no
-    extra time; and each limit when it is reached first."""
+    """Reports used time and resources, which count for a resumed agent too, and reached limits."""
     told = ""
     while True:
         emit(messages.AgentUsed(used_s=clock.used_s(), resources=resources.used()))
-        reached = resources.reached()
-        if reached and not told:
-            told = reached
-            emit(messages.AgentDoing(note=reached))
+        if not told and (told := resources.reached()):
+            emit(messages.AgentDoing(note=told))
         await asyncio.sleep(_TELL_TIME_S)
 
 
 async def _stopped(orders: Orders, clock: AgentClock, activity: Activity | None) -> None:
     """Returns when the parent requests the stop or is gone; until then forwards its reports to the clocks."""
     while (order := await orders.next()) is not None:
-        if isinstance(order, messages.HeldTime):
-            clock.held(order.seconds)
-        if isinstance(order, messages.SubmitsSeen) and activity is not None:
-            activity.note(order.asked, order.running)
+        if isinstance(order, messages.SubmitsSeen):
+            clock.held(order.held_s)
+            if activity is not None:
+                activity.note(order.asked, order.running)
         if isinstance(order, messages.StopAgent):
             return
 
@@ -226,10 +225,10 @@ async def _main() -> int:
     first = await orders.next()
     if not isinstance(first, StartAgent):
         return 2
-    if first.lock is not None:
-        # Held by this process alone until its death: no program of the agent inherits it.
-        file = os.open(first.lock, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
-        await asyncio.to_thread(fcntl.flock, file, fcntl.LOCK_EX)
+    # Held by this process alone until its death, after an earlier holder: no program of the agent inherits it.
+    lock = RunFolder(Path(first.folder)).supervisor_lock
+    file = os.open(lock, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+    await asyncio.to_thread(fcntl.flock, file, fcntl.LOCK_EX)
     main = asyncio.create_task(keep(first, orders))
     for number in (signal.SIGTERM, signal.SIGINT):
         loop.add_signal_handler(number, orders.end)

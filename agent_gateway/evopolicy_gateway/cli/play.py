@@ -24,9 +24,15 @@ from evopolicy_gateway.cli.options import Of, Shown, spread
 from evopolicy_gateway.jail.settings import JailSettings
 from evopolicy_gateway.operator.cluster import Cluster
 from evopolicy_gateway.run import recorded_agent
-from evopolicy_gateway.run.options import cases_of, one_environment, packages_for
 from evopolicy_gateway.run.plan import Plan
-from evopolicy_gateway.run.run_options import ClusterOptions, ListenerOptions, RunOptions
+from evopolicy_gateway.run.run_options import (
+    ClusterOptions,
+    ListenerOptions,
+    RunOptions,
+    cases_of,
+    one_environment,
+    packages_for,
+)
 from evopolicy_gateway.run_folder import listener
 from evopolicy_gateway.run_folder.layout import folder_of
 from evopolicy_gateway.suite import runs as plain_runs

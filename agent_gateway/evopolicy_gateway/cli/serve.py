@@ -20,7 +20,7 @@ from evopolicy_common.errors import ConfigError
 from evopolicy_common.logs import structlog
 from evopolicy_common.processes.preflight import foreseen
 from evopolicy_gateway.processes import child_messages
-from evopolicy_gateway.processes.child_messages import Orders, Progress, Ready, RunClosed, Waits
+from evopolicy_gateway.processes.child_messages import Orders, Progress, Ready, Waits
 from evopolicy_gateway.run.gateway import Gateway
 from evopolicy_gateway.run_folder.layout import RunFolder, folder_of
 from evopolicy_gateway.run_folder.listener import AgentPlace, place_of
@@ -84,7 +84,8 @@ def serve(
             known = (folder, tuple(connect or ()), credentials_file)
             closed = asyncio.run(_serve(known, place, json_output, controlled))
     sys.stdout.flush()
-    # A thread that still reads stdin, or a session that cannot be closed, must not hold up the exit.
+    # A thread that still reads stdin, or a session that cannot be closed, must not hold up the exit. Status 0 tells
+    # the parent that the coordinator has closed the run.
     os._exit(0 if closed or not controlled else 3)
 
 
@@ -150,8 +151,6 @@ async def _serve(
             listener.cancel()
             with contextlib.suppress(asyncio.CancelledError):
                 await listener
-    if closed and controlled:
-        child_messages.emit(RunClosed())
     return closed
 
 

@@ -7,53 +7,42 @@ from typing import Any
 
 import msgspec
 
-from evopolicy_common.messages.gateway import RunOpened, RunState
+from evopolicy_common.messages.gateway import RunState
 from evopolicy_common.records.run_record import PROTOCOL_VERSION
-from evopolicy_gateway.submits.tickets import Ticket
+from evopolicy_gateway.submits.tickets import Ticket, TicketMachine
 from evopolicy_gateway.workspace.agents_md import LAST_WORDS_S
 
 _COUNTS = ("episode_budget", "min_episodes_per_submit", "max_episodes_per_submit")
 _SETTINGS = ("policy_scope", "finish", "feedback", "observations", "sandbox_tier", "video")
 
 
-def info_document(
-    run: RunOpened,
-    state: RunState,
-    finalized: bool,
-    in_flight: Ticket | None,
-    last_warning: str | None = None,
-) -> dict[str, Any]:
+def info_document(machine: TicketMachine) -> dict[str, Any]:
     """Everything that an agent may know of the run, as plain values."""
+    run, state = machine.run, machine.state
     env = run.env
-    env_meta: dict[str, Any] = {
-        "env": env.env,
-        "env_version": env.env_version,
-        "n_env_instances": run.n_env_instances,
-        "max_episode_steps": run.announced_steps,
-        **{name: getattr(env, name) for name in ("obs_space", "action_space", "obs_storage")},
-    }
+    env_meta = {name: getattr(env, name) for name in ("env", "env_version")}
+    env_meta |= {"n_env_instances": run.n_env_instances, "max_episode_steps": run.announced_steps}
+    env_meta |= {name: getattr(env, name) for name in ("obs_space", "action_space", "obs_storage")}
     if names := env.reward_components:
         env_meta["reward_components"] = {name: env.reward_texts.get(name, "") for name in names}
-    limits = msgspec.to_builtins(run.limits)
     rollout_wall_s = min(run.limits.episode_wall_s, run.limits.submit_wall_s or math.inf)
     return {
         "protocol_version": PROTOCOL_VERSION,
         "state": {
             "remaining_budget": state.remaining_budget,
             "n_submits": state.n_submits,
-            "is_finalized": finalized or state.is_finalized,
+            "is_finalized": machine.spent or state.is_finalized,
         },
         "env_meta": env_meta,
         "episode_ends_after": min(env.max_episode_steps, run.announced_steps),
         **{name: getattr(run, name) for name in _COUNTS},
-        "resource_limits": {"rollout_wall_s": rollout_wall_s} | limits,
-        "allowed_imports": list(run.allowed_imports),
-        "denied_imports": list(run.denied_imports),
+        "resource_limits": {"rollout_wall_s": rollout_wall_s} | msgspec.to_builtins(run.limits),
+        **{name: list(getattr(run, name)) for name in ("allowed_imports", "denied_imports")},
         **{name: getattr(run, name) for name in _SETTINGS},
         "deterministic": env.deterministic,
         "end_grace_s": LAST_WORDS_S,
-        "last_warning": last_warning,
-        "submit_in_flight": None if in_flight is None else progress_document(in_flight, state),
+        "last_warning": machine.last_warning,
+        "submit_in_flight": machine.in_flight and progress_document(machine.in_flight, state),
     }
 
 

@@ -38,13 +38,19 @@ class Address(msgspec.Struct, frozen=True, kw_only=True):
 
 
 async def bind(folder: RunFolder) -> tuple[socket.socket, Address]:
-    """Returns a bound socket, on the port of the last start or else on a free one, which is saved for the next start.
-
-    Raises ConfigError when the saved or the requested port is not available.
-    """
+    """A socket bound to the last start's port, or to a new one that is saved. ConfigError if taken."""
     if folder.service.exists():
         address = saved(folder.service, Address)
-        return await _rebind(address), address
+        for _ in range(_REBIND_TRIES):
+            try:
+                return bound(address.host, address.port), address
+            except OSError as error:
+                reason = error
+            await asyncio.sleep(_REBIND_PAUSE_S)
+        raise ConfigError(
+            f"port {address.port} on {address.host}, which is the address of this run's agent, cannot be used:"
+            f" {reason.strerror}; end what listens there and start the gateway again"
+        )
     named, bearer = Listener(host=LOOPBACK, port=0), ""
     if folder.listener.exists():
         named, bearer = saved(folder.listener, Listener), secrets.token_hex(32)
@@ -61,16 +67,3 @@ async def bind(folder: RunFolder) -> tuple[socket.socket, Address]:
         write_atomically(folder.bearer, f"{bearer}\n".encode(), mode=0o600)
     save(folder.service, address)
     return sock, address
-
-
-async def _rebind(address: Address) -> socket.socket:
-    for _ in range(_REBIND_TRIES):
-        try:
-            return bound(address.host, address.port)
-        except OSError as error:
-            reason = error
-        await asyncio.sleep(_REBIND_PAUSE_S)
-    raise ConfigError(
-        f"port {address.port} on {address.host}, which is the address of this run's agent, cannot be used:"
-        f" {reason.strerror}; end what listens there and start the gateway again"
-    )

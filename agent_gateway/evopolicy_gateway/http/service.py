@@ -53,10 +53,8 @@ def make_app(pipeline: SubmitPipeline, token: str, bearer: str = "") -> ASGIApp:
     task = task_markdown(machine.run).encode()
 
     async def info(request: Request) -> Response:
-        state = await pipeline.refresh()
-        return _json(
-            200, info_document(machine.run, state, machine.spent, machine.in_flight, machine.last_warning)
-        )
+        await pipeline.refresh()
+        return _json(200, info_document(machine))
 
     async def task_text(request: Request) -> Response:
         return Response(task, media_type="text/markdown; charset=utf-8")

@@ -54,14 +54,20 @@ class File(NamedTuple):
     executable: bool
 
 
+class Server(msgspec.Struct, frozen=True):
+    """How to start an MCP server in the jail."""
+
+    command: str
+    args: tuple[str, ...] = ()
+    env: dict[str, str] = {}
+
+
 class Content(NamedTuple):
     """One input with its files, by their paths below its folder."""
 
     recorded: AgentInput
     files: Mapping[str, File]
-    words: tuple[str, ...] = ()
-    """A server's command line in the jail."""
-    environment: Mapping[str, str] = {}
+    server: Server | None = None
 
 
 def read(skills: Sequence[str], servers: Mapping[str, McpServer], started_in: Path) -> list[Content]:
@@ -104,7 +110,12 @@ def _server(name: str, server: McpServer, started_in: Path) -> Content:
         if any(other.name == root.name and other != root for other in roots.values()):
             raise ConfigError(f"{field}: two of its files or folders are named {root.name!r}; rename one")
         files |= _files(f"{field}: {path}", root, root.name)
-    program = _program(field, server.command, started_in)
+    own = started_in / server.command
+    beside = "/" in server.command and own.is_file()
+    program = os.path.abspath(own) if beside else shutil.which(server.command)
+    if program is None:
+        why = f"there is no program {server.command!r}, neither as a file nor on the PATH"
+        raise ConfigError(f"{field}.command: {why}")
     try:
         with open(program, "rb") as file:
             digest = hashlib.file_digest(file, "sha256").hexdigest()
@@ -112,17 +123,7 @@ def _server(name: str, server: McpServer, started_in: Path) -> Content:
         raise ConfigError(f"{program} cannot be read: {error.strerror}") from error
     about = [os.path.basename(program), digest, words, sorted(server.environment.items())]
     recorded = AgentInput(kind="mcp", name=name, digest=_digest(files, about), hosts=server.hosts)
-    return Content(recorded, files, (program, *words), server.environment)
-
-
-def _program(field: str, command: str, started_in: Path) -> str:
-    own = started_in / command
-    program = os.path.abspath(own) if "/" in command and own.is_file() else shutil.which(command)
-    if program is None:
-        raise ConfigError(
-            f"{field}.command: there is no program {command!r}, neither as a file nor on the PATH"
-        )
-    return program
+    return Content(recorded, files, Server(program, tuple(words), server.environment))
 
 
 def _check_name(field: str, name: str) -> None:
@@ -133,7 +134,7 @@ def _check_name(field: str, name: str) -> None:
 
 
 def _below(field: str, path: str, started_in: Path) -> Path:
-    """The path as absolute one. ConfigError where it leads out of the folder, or over a link."""
+    """The absolute path. ConfigError where it leads out of the folder, or over a link."""
     whole = Path(os.path.normpath(started_in / path))
     if not whole.is_relative_to(started_in) or whole == started_in:
         raise ConfigError(
@@ -150,8 +151,7 @@ def _below(field: str, path: str, started_in: Path) -> Path:
 
 
 def _files(field: str, root: Path, prefix: str) -> Iterator[tuple[str, File]]:
-    """A file, or all files of a folder, by path from `prefix` on. ConfigError for links, devices, and too many or too
-    large ones."""
+    """The files at `root`, by path from `prefix` on. ConfigError for links, devices, and too much."""
     remaining, n, pending = MAX_BYTES, 0, [(root, prefix)]
     while pending:
         path, name = pending.pop()

@@ -9,7 +9,6 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import msgspec
 
@@ -17,18 +16,10 @@ from evopolicy_common.errors import ConfigError
 from evopolicy_common.processes.scratch import remove_tree
 from evopolicy_common.records.blobs import write_atomically
 from evopolicy_common.records.run_record import AgentInput
-from evopolicy_gateway.inputs.declared import IN_JAIL, Content, McpServer, read
+from evopolicy_gateway.inputs.declared import IN_JAIL, Content, McpServer, Server, read
 
 MCP_FILE = f"{IN_JAIL}/mcp.json"
 """The servers in the form that many CLIs read, `{"mcpServers": {…}}`."""
-
-
-class Server(msgspec.Struct, frozen=True, kw_only=True):
-    """How to start an MCP server in the jail."""
-
-    command: str
-    args: tuple[str, ...] = ()
-    env: dict[str, str] = {}
 
 
 class Kept(msgspec.Struct, frozen=True, kw_only=True):
@@ -46,10 +37,10 @@ class Kept(msgspec.Struct, frozen=True, kw_only=True):
         """Each copy with its place in the jail; `skills_at`: folder in which the agent looks for skills."""
         if self.folder is None or not self:
             return []
-        binds = [(str(self.folder / "skills" / name), f"{skills_at}/{name}") for name in self.skills]
-        own = [name for name in self.servers if (self.folder / "mcp" / name).is_dir()]
-        binds += [(str(self.folder / "mcp" / name), f"{IN_JAIL}/mcp/{name}") for name in own]
-        return [*binds, (str(self.folder / "mcp.json"), MCP_FILE)]
+        places = {f"skills/{name}": f"{skills_at}/{name}" for name in self.skills}
+        own = [f"mcp/{name}" for name in self.servers if (self.folder / "mcp" / name).is_dir()]
+        places |= {path: f"{IN_JAIL}/{path}" for path in own} | {"mcp.json": MCP_FILE}
+        return [(str(self.folder / path), place) for path, place in places.items()]
 
 
 def keep(
@@ -59,27 +50,22 @@ def keep(
     folder: Path,
     expected: Sequence[AgentInput],
 ) -> Kept:
-    """The copies in `folder`, made where there are none. ConfigError when the declared files, or the copies, are not
-    those with which the run was opened."""
+    """The copies in `folder`, made if missing. ConfigError when the inputs differ from `expected`."""
     declared = read(skills, servers, started_in)
-    _check_unchanged([each.recorded for each in declared], expected)
-    if not (folder / "mcp.json").exists():
-        remove_tree(folder)
-        _write(declared, folder)
-    for each in declared:
-        _check_copy(each, folder)
-    skills_named = tuple(each.recorded.name for each in declared if each.recorded.kind == "skill")
-    return Kept(folder=folder, skills=skills_named, servers=_servers(declared))
-
-
-def _check_unchanged(now: Sequence[AgentInput], then: Sequence[AgentInput]) -> None:
-    differing = {(each.kind, each.name) for each in set(now) ^ set(then)}
-    if differing:
-        names = ", ".join(f"{kind} {name}" for kind, name in sorted(differing))
+    if changed := {(each.kind, each.name) for each in {each.recorded for each in declared} ^ set(expected)}:
+        names = ", ".join(f"{kind} {name}" for kind, name in sorted(changed))
         raise ConfigError(
             f"{names} in the agent's file changed after the run was opened: restore what was there, or start the run"
             " anew with --overwrite"
         )
+    started = {each.recorded.name: each.server for each in declared if each.server is not None}
+    if not (folder / "mcp.json").exists():
+        remove_tree(folder)
+        _write(declared, started, folder)
+    for each in declared:
+        _check_copy(each, folder)
+    skills_named = tuple(each.recorded.name for each in declared if each.recorded.kind == "skill")
+    return Kept(folder=folder, skills=skills_named, servers=started)
 
 
 def _place(folder: Path, about: AgentInput) -> Path:
@@ -87,24 +73,19 @@ def _place(folder: Path, about: AgentInput) -> Path:
 
 
 def _check_copy(content: Content, folder: Path) -> None:
-    """Raises ConfigError when a copy does not have the content."""
     about, place = content.recorded, _place(folder, content.recorded)
-    copies = {
-        path.relative_to(place).as_posix(): path
-        for path in place.rglob("*")
-        if path.is_symlink() or not path.is_dir()
-    }
-    same = copies.keys() == content.files.keys() and all(
-        not path.is_symlink() and path.is_file() and path.read_bytes() == content.files[name].data
+    paths = (path for path in place.rglob("*") if path.is_symlink() or not path.is_dir())
+    copies = {path.relative_to(place).as_posix(): path for path in paths}
+    if copies.keys() != content.files.keys() or any(
+        path.is_symlink() or not path.is_file() or path.read_bytes() != content.files[name].data
         for name, path in copies.items()
-    )
-    if not same:
+    ):
         raise ConfigError(
             f"the run's copy of {about.kind} {about.name} in {place} was changed: start the run anew with --overwrite"
         )
 
 
-def _write(declared: Sequence[Content], folder: Path) -> None:
+def _write(declared: Sequence[Content], servers: dict[str, Server], folder: Path) -> None:
     for each in declared:
         for name, file in each.files.items():
             path = _place(folder, each.recorded) / name
@@ -112,14 +93,6 @@ def _write(declared: Sequence[Content], folder: Path) -> None:
             path.write_bytes(file.data)
             path.chmod(0o555 if file.executable else 0o444)
     folder.mkdir(parents=True, exist_ok=True)
-    document: dict[str, Any] = {"mcpServers": msgspec.to_builtins(_servers(declared))}
     # Written last and atomically: it marks the copies as complete.
-    write_atomically(folder / "mcp.json", json.dumps(document, indent=2).encode())
-
-
-def _servers(declared: Sequence[Content]) -> dict[str, Server]:
-    return {
-        each.recorded.name: Server(command=each.words[0], args=each.words[1:], env=dict(each.environment))
-        for each in declared
-        if each.recorded.kind == "mcp"
-    }
+    document = json.dumps({"mcpServers": msgspec.to_builtins(servers)}, indent=2)
+    write_atomically(folder / "mcp.json", document.encode())

@@ -53,8 +53,7 @@ _MIN_SECRET = 16
 
 
 def places(user_config: bool | tuple[str, ...], program: str) -> tuple[str, ...]:
-    """Paths that `user_config` copies. Raises ConfigError for a path that is not below `~/`, and for `true` with an
-    unknown program."""
+    """Paths that `user_config` copies. ConfigError for one outside `~/`, or `true` for an unknown CLI."""
     if not isinstance(user_config, bool):
         for path in user_config:
             if not path.startswith("~/") or os.path.normpath(path) != path.rstrip("/") or path == "~/":
@@ -118,7 +117,7 @@ def secrets(paths: Sequence[str]) -> list[str]:
     texts: list[str] = []
     for path in paths:
         source = Path(path).expanduser()
-        # A folder, or a file in another form: left to the redaction of what looks like a key.
+        # A folder, or a file in another form: the redaction of key-like texts covers it.
         with contextlib.suppress(OSError, ValueError, RecursionError):
             texts += _secrets_in(_document(source.name, source.read_text()))
     return [text for text in texts if len(text) >= _MIN_SECRET and not any(map(str.isspace, text))]

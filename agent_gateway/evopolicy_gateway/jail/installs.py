@@ -1,6 +1,6 @@
 """Files of this machine that an agent's program needs: its installation, the interpreter of its first line, our Python.
 
-A whole folder is shown only if it looks like an installation of its own; otherwise only the file.
+A whole folder is shown only if it is an installation of its own by its marks; otherwise only the file.
 """
 
 from __future__ import annotations
@@ -39,7 +39,6 @@ class Needs:
         """Path of each link to its target."""
 
     def path(self, path: str) -> None:
-        """Adds a file or folder."""
         if not _in_system(path) and os.path.exists(path):
             self.paths[path] = None
 
@@ -49,10 +48,7 @@ class Needs:
 
 
 def needs_of(command: Sequence[str], search: str | None, more: Sequence[Sequence[str]] = ()) -> Needs:
-    """The files that the operator's command needs: its program, those that it names, and our own Python.
-
-    `search`: the PATH. `more`: commands of which the programs are needed.
-    """
+    """The files that the operator's command and programs of `more` need, and our Python. `search`: PATH."""
     needs = Needs()
     _our_python(needs)
     for words in (command, *more):
@@ -66,8 +62,7 @@ def needs_of(command: Sequence[str], search: str | None, more: Sequence[Sequence
 
 
 def hidden_below(folder: str) -> Iterator[str]:
-    """Yields files and folders of packages that no agent may see, in Python installations at and directly below
-    `folder`."""
+    """Yields what no agent may see in Python installations at and directly below `folder`."""
     root = Path(folder)
     sites = [root] if root.name in _SITE_FOLDERS else []
     for base in ("", "lib/", "lib64/", "local/lib/", "versions/*/lib/", "envs/*/lib/", "*/lib/"):
@@ -84,8 +79,7 @@ def _our_python(needs: Needs) -> None:
     """Adds the interpreter with its standard library, numpy, cloudpickle, and this package's agents; nothing else."""
     prefix, base = os.path.abspath(sys.prefix), os.path.abspath(sys.base_prefix)
     needs.path(base)
-    if os.path.realpath(base) != base:
-        needs.path(os.path.realpath(base))
+    needs.path(os.path.realpath(base))
     if prefix == base:
         return
     needs.path(f"{prefix}/pyvenv.cfg")
@@ -97,10 +91,7 @@ def _our_python(needs: Needs) -> None:
 
 
 def our_packages(more: Sequence[str] = ()) -> Iterator[tuple[str, str]]:
-    """Yields the packages that shipped agents need, each with its path in the jail's virtual environment.
-
-    `more`: distributions that an agent needs besides. Raises ConfigError when one is not installed.
-    """
+    """Yields shipped agents' packages and `more`, with paths in the jail. ConfigError for a missing one."""
     if os.path.abspath(sys.prefix) == os.path.abspath(sys.base_prefix):
         return
     site = sysconfig.get_path("platlib")

@@ -69,62 +69,53 @@ class Way:
     ) -> None:
         """`proxy` None: the network is open. `pids`, `fixed_cores`: as for `Jail`."""
         self._proxy = proxy
-        self._supervisor: socket.socket | None = None
-        self._child: socket.socket | None = None
+        self._supervisor, child = socket.socketpair()
         self._serving: asyncio.Task[None] | None = None
         # By --args: the jail's first process shows its command line to the agent, and the arguments name hidden
         # folders.
-        self._files = [_readable(b"".join(os.fsencode(word) + b"\0" for word in jail[1:]))]
-        self.words = [*_PATIENT, jail[0], "--args", str(self._files[0])]
-        self._files.append(_readable(filter_program(fixed_cores=fixed_cores)))
-        self.words += ["--seccomp", str(self._files[1])]
+        arguments = _readable(b"".join(os.fsencode(word) + b"\0" for word in jail[1:]))
+        calls = _readable(filter_program(fixed_cores=fixed_cores))
+        self.pass_fds = [arguments, calls]
+        self.words = [*_PATIENT, jail[0], "--args", str(arguments), "--seccomp", str(calls)]
         python = os.path.realpath(getattr(sys, "_base_executable", sys.executable))
         self.words += ["--", python, "-I", "-S", ENTRY]
         if proxy is None:
+            child.close()
             self.words += ["-", "-"]
         else:
-            self._supervisor, self._child = socket.socketpair()
-            self.words += [str(self._child.fileno()), ",".join(map(str, proxy.ports))]
+            self.pass_fds.append(child.detach())
+            self.words += [str(self.pass_fds[2]), ",".join(map(str, proxy.ports))]
         self.words += ["-" if pids is None else str(pids), *program]
-
-    @property
-    def pass_fds(self) -> tuple[int, ...]:
-        return (*self._files, *(() if self._child is None else (self._child.fileno(),)))
 
     def started(self, ended: Callable[[], Awaitable[object]]) -> None:
         """Serves the program's network access until `ended` returns, which is when the program has ended."""
         self._close_files()
-        if self._child is not None:
-            self._child.close()
-            self._serving = asyncio.create_task(self._serve(ended))
+        if self._proxy is None:
+            self._supervisor.close()
+        else:
+            self._serving = asyncio.create_task(self._serve(self._proxy, ended))
 
     def failed(self) -> None:
         """Releases the descriptors of a program that could not be started, or has ended."""
         self._close_files()
-        for sock in (self._supervisor, self._child):
-            if sock is not None:
-                sock.close()
+        self._supervisor.close()
 
     def _close_files(self) -> None:
-        for fd in self._files:
-            os.close(fd)
-        self._files = []
+        while self.pass_fds:
+            os.close(self.pass_fds.pop())
 
-    async def _serve(self, ended: Callable[[], Awaitable[object]]) -> None:
-        assert self._proxy is not None
-        assert self._supervisor is not None
-        serving = asyncio.ensure_future(self._proxy.serve(self._supervisor))
+    async def _serve(self, proxy: JailProxy, ended: Callable[[], Awaitable[object]]) -> None:
+        serving = asyncio.ensure_future(proxy.serve(self._supervisor))
         try:
             await ended()
         finally:
             serving.cancel()
             await asyncio.gather(serving, return_exceptions=True)
-            await self._proxy.close()
+            await proxy.close()
             self._supervisor.close()
 
 
 def _readable(data: bytes) -> int:
-    """A descriptor from which `data` can be read."""
     fd = os.memfd_create("evopolicy-jail")
     with open(fd, "wb", closefd=False) as file:
         file.write(data)
@@ -208,7 +199,6 @@ class Jail:
         }
 
     def way(self, program: Sequence[str]) -> Way:
-        """Prepares one start of a program."""
         proxy = None if self._open_network else self._proxy()
         return Way(self._view.arguments(), program, proxy, **self._limits)
 

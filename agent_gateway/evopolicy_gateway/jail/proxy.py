@@ -10,6 +10,7 @@ import asyncio
 import contextlib
 import socket
 from collections.abc import Mapping
+from functools import partial
 
 from evopolicy_common.logs import structlog
 from evopolicy_gateway.jail.settings import Host
@@ -47,8 +48,7 @@ class JailProxy:
         return (*self._forwards, self.proxy_port)
 
     async def serve(self, control: socket.socket) -> None:
-        """Receives the listening sockets from the jail and serves them; returns if the program ended before sending
-        them."""
+        """Serves the listening sockets of the jail; returns if the program ended before sending them."""
         loop = asyncio.get_running_loop()
         control.setblocking(False)
         ready = asyncio.Event()
@@ -61,10 +61,7 @@ class JailProxy:
         for port, fd in zip(self.ports, fds, strict=False):
             sock = socket.socket(fileno=fd)
             sock.setblocking(False)
-
-            def accept(reader: asyncio.StreamReader, writer: asyncio.StreamWriter, port: int = port) -> None:
-                self._accept(port, reader, writer)
-
+            accept = partial(self._accept, port)
             self._servers.append(await asyncio.start_server(accept, sock=sock, limit=_MAX_HEAD_BYTES))
 
     async def close(self) -> None:

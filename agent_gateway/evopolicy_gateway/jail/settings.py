@@ -60,8 +60,8 @@ class JailSettings(msgspec.Struct, frozen=True, kw_only=True):
 
     def chosen(self) -> dict[str, Any]:
         """The operator's additions to the jail, for `run.json`."""
-        kept = {"read": self.read, "write": self.write, "environment": self.environment, "hosts": self.hosts}
-        return {name: list(value) for name, value in kept.items() if value}
+        names = ("read", "write", "environment", "hosts")
+        return {name: list(value) for name in names if (value := getattr(self, name))}
 
     def of_remote_agent(self) -> JailSettings:
         """No jail, since the operator starts a remote agent. Raises ConfigError when one is requested."""
@@ -92,8 +92,7 @@ class JailSettings(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def host(text: str, option: str = "--allow-host") -> Host:
-    """Parses `HOST` or `HOST:PORT` into lower-case name and port. Raises ConfigError for anything else, and
-    patterns."""
+    """Parses `HOST` or `HOST:PORT` into lower-case name and port. ConfigError for anything else."""
     match = _HOST.fullmatch(text)
     port = HTTPS if match is None or match["port"] is None else int(match["port"])
     if match is None or not 0 < port < 1 << 16:
@@ -112,6 +111,7 @@ def check_bubblewrap() -> None:
         )
     flags = ("--unshare-user", "--unshare-pid", "--unshare-net", "--unshare-ipc", "--unshare-uts")
     command = [program, *flags, "--ro-bind", "/", "/", "--proc", "/proc", "--dev", "/dev", "true"]
+    why: object = None
     try:
         tried = subprocess.run(
             command,
@@ -119,13 +119,15 @@ def check_bubblewrap() -> None:
             capture_output=True,
             timeout=_TIMEOUT_S,
             check=False,
-            start_new_session=True,  # Ctrl-C would end it too, which looks like a machine that refuses
+            start_new_session=True,  # else Ctrl-C would end it too, as on a machine that refuses
         )
+        if tried.returncode:
+            why = tried.stderr.decode("utf-8", "replace").strip() or f"exit status {tried.returncode}"
     except (OSError, subprocess.TimeoutExpired) as error:
-        raise ConfigError(f"the agent's jail cannot be built here ({error}): {_remedy()}") from error
-    if tried.returncode:
-        output = tried.stderr.decode("utf-8", "replace").strip() or f"exit status {tried.returncode}"
-        raise ConfigError(f"the agent's jail cannot be built here ({output}): {_remedy()}")
+        why = error
+    if why is not None:
+        remedy = f"permit user namespaces ({distribution.permit_namespaces()}), {GIVE_UP}"
+        raise ConfigError(f"the agent's jail cannot be built here ({why}): {remedy}")
 
 
 def absolute(path: str, started_in: Path) -> str:
@@ -141,7 +143,3 @@ def _check_path(option: str, path: Path) -> None:
         raise ConfigError(f"{option} /: this would bind the whole machine; use --jail none instead")
     if STATE in real.parts or any(next(real.glob(pattern), None) for pattern in _STATE_FOLDERS):
         raise ConfigError(f"{option} {path}: it holds the credentials of a run that is open")
-
-
-def _remedy() -> str:
-    return f"permit user namespaces ({distribution.permit_namespaces()}), {GIVE_UP}"

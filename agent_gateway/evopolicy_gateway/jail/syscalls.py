@@ -78,7 +78,6 @@ def filter_program(*, fixed_cores: bool = False) -> bytes:
 
 
 def _without_set_id(call: str) -> list[Instruction]:
-    """Decides on a call that gives a file its mode."""
     if call == "openat2":  # its mode is in memory, which a filter cannot read; programs fall back to `openat`
         return [refuse(errno.ENOSYS)]
     at = _MODE_AT.get(call) or _MODE_AT[call.partition("at")[0]] + 1

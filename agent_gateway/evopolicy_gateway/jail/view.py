@@ -63,8 +63,7 @@ class View(msgspec.Struct, frozen=True, kw_only=True):
     """Files and folders of the run that are shown read-only, each with its path in the jail."""
 
     def prepare(self) -> None:
-        """Creates the agent's home and /tmp; existing ones stay, for an agent that resumes after its supervisor
-        died."""
+        """Creates the agent's home and /tmp; existing ones stay, for an agent that resumes."""
         for name in ("home", "tmp", "proc"):
             (self.private / name).mkdir(mode=0o700, parents=True, exist_ok=True)
         for name in _PROC_COPIES:
@@ -162,9 +161,7 @@ def _bubblewrap() -> list[str]:
 
 
 def confined(read: Sequence[Path], write: Sequence[Path]) -> list[str]:
-    """The bubblewrap command, up to the program, for a process of our own that needs the network: it sees the system,
-    `read` and
-    `write`, and no variable but those of its proxy and certificates."""
+    """The bubblewrap command for a process of ours with network; it sees the system, `read`, and `write`."""
     command = [*_bubblewrap(), *_system(True)]
     command += ["--proc", "/proc", "--dev", "/dev", "--tmpfs", "/tmp", "--clearenv"]
     for name in ("PATH", *_PROXY_VARIABLES, *map(str.lower, _PROXY_VARIABLES), *_CERTIFICATES):

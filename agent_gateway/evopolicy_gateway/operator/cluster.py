@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import sys
+import time
 from collections.abc import AsyncIterator, Collection, Iterable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -48,13 +49,10 @@ class Cluster(msgspec.Struct, frozen=True, kw_only=True):
     web: Path | None = None
     """Folder of runs that a live view shows meanwhile; None for no view."""
 
-    @property
-    def _without_data(self) -> bool:
-        return self.local is not None and self.local.data is None
-
     def check_cases(self, runs: Iterable[RunSettings]) -> None:
         """Raises ConfigError when a local cluster lacks the case files that a run plays."""
-        if self._without_data and any(run.profile != "own" for run in runs):
+        derived = self.local is not None and self.local.data is None
+        if derived and any(run.profile != "own" for run in runs):
             raise ConfigError(
                 "--profile published plays the published case files: give --data FOLDER, the folder data/main-128 of"
                 " the published software, which holds gym/acrobot/train.json and so on"
@@ -62,12 +60,13 @@ class Cluster(msgspec.Struct, frozen=True, kw_only=True):
 
     def check_ids(self, env_ids: Iterable[str], split: Split, cases: Sequence[int]) -> None:
         """Raises ConfigError for cases that a local cluster lacks. Other clusters' case files state their numbers."""
-        for suite in map(catalogue.suite_of, env_ids) if self._without_data else ():
-            n = {"train": suite.n_train, "validation": suite.n_validation, "heldout": suite.n_heldout}[split]
-            if cases and max(cases) >= n:
-                raise ConfigError(
-                    f"--cases: there is no {split} case {max(cases)}; the cases are 0 to {n - 1}"
-                )
+        if self.local is None or self.local.data is not None:
+            return
+        last = max(cases, default=-1)
+        for suite in map(catalogue.suite_of, env_ids):
+            n = getattr(suite, f"n_{split}")
+            if last >= n:
+                raise ConfigError(f"--cases: there is no {split} case {last}; the cases are 0 to {n - 1}")
 
 
 class Reached(NamedTuple):
@@ -107,10 +106,7 @@ async def reached(where: Cluster, workers: Workers | None = None) -> AsyncIterat
 async def connected(
     where: Cluster, env_ids: Sequence[str], tiers: Collection[Tier]
 ) -> AsyncIterator[tuple[Operations, Credentials, asyncio.Future[None] | None]]:
-    """Connects to the cluster. Yields operations, gateway credentials, and a future that fails with a local cluster.
-
-    `tiers`: sandbox tiers that will be requested; a local cluster without them fails.
-    """
+    """Yields operations, gateway credentials, and a future that fails with a local cluster."""
     end_on_sigterm()
     workers = None if where.local is None else Workers(env_ids, where.local.slots, tiers)
     async with reached(where, workers) as (operations, gateway, local):
@@ -119,10 +115,7 @@ async def connected(
 
 @contextlib.asynccontextmanager
 async def live_view(root: Path, connect: Sequence[str], file: Path | None) -> AsyncIterator[None]:
-    """Shows the runs in `root` and the cluster inside the `async with`; prints the URL.
-
-    Raises ConfigError when the view does not start.
-    """
+    """Shows the runs in `root` and the cluster; prints the URL. ConfigError if it does not start."""
     root.mkdir(parents=True, exist_ok=True)
     with scratch_folder("view") as folder:
         address, log = folder / "address", folder / "view.log"
@@ -133,18 +126,17 @@ async def live_view(root: Path, connect: Sequence[str], file: Path | None) -> As
         if file is not None:
             program += ["--credentials", str(file)]
         child = await ChildProcess.start(program, log)
+        late = time.monotonic() + _START_TIMEOUT_S
         try:
-            try:
-                async with asyncio.timeout(_START_TIMEOUT_S):
-                    while not address.exists():
-                        if child.exit_code is not None:
-                            raise ConfigError(f"--web: {last_words(log) or 'the view ended at its start'}")
-                        await asyncio.sleep(_POLL_S)
-            except TimeoutError as error:
-                raise ConfigError(
-                    f"--web: the view did not start within {_START_TIMEOUT_S:g} s; leave out --web, and start it with"
-                    f" `evopolicy web {root}`"
-                ) from error
+            while not address.exists():
+                if child.exit_code is not None:
+                    raise ConfigError(f"--web: {last_words(log) or 'the view ended at its start'}")
+                if time.monotonic() > late:
+                    raise ConfigError(
+                        f"--web: the view did not start within {_START_TIMEOUT_S:g} s; leave out --web, and start it"
+                        f" with `evopolicy web {root}`"
+                    )
+                await asyncio.sleep(_POLL_S)
             say(f"view: {address.read_text()}", err=True)
             address.unlink()  # it holds the token, and an agent without a jail can read this user's files
             yield

@@ -65,7 +65,6 @@ class TriedEpisode(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def played_by(self) -> str:
-        """The source of the actions."""
         if self.episode_return is None:
             return "not played"
         if self.failure is None:
@@ -162,29 +161,29 @@ async def _result(
     episodes = []
     cases = range(len(outcomes)) if message.cases is None else message.cases
     for outcome, case in zip(outcomes, cases, strict=True):
-        target = None if folder is None else folder / f"ep_{outcome.index:03d}"
-        if target is not None:
+        target = None
+        if folder is not None:
+            target = folder / f"ep_{outcome.index:03d}"
             ref = outcome.trajectory
             packed = None if ref is None else await operations.fetch(ref)
             await asyncio.to_thread(_write, target, packed, outcome)
-        episodes.append(
-            TriedEpisode(
-                case=case,
-                episode_return=outcome.episode_return if outcome.length else None,
-                length=outcome.length,
-                failure=failure_text(outcome.failure),
-                failed_at=None if outcome.failure is None else outcome.failure.step_index,
-                folder=None if target is None else str(target),
-            )
+        tried = TriedEpisode(
+            case=case,
+            episode_return=outcome.episode_return if outcome.length else None,
+            length=outcome.length,
+            failure=failure_text(outcome.failure),
+            failed_at=None if outcome.failure is None else outcome.failure.step_index,
+            folder=None if target is None else str(target),
         )
-    good = [one.episode_return for one in episodes if one.failure is None]
-    returns = [one for one in good if one is not None]
+        episodes.append(tried)
+    good = [one for one in episodes if one.failure is None]
+    returns = [one.episode_return for one in good if one.episode_return is not None]
     local = where.local
     return TrialResult(
         env=message.env,
         mean_return=mean(returns) if returns else None,
         std_return=std(returns) if returns else None,
-        n_failed=sum(one.failure is not None for one in episodes),
+        n_failed=len(episodes) - len(good),
         episodes=tuple(episodes),
         folder=None if folder is None else str(folder),
         other_cases_next_time=local is not None and local.state is None and local.data is None,
@@ -219,14 +218,12 @@ def policy_bundle(policy: Path) -> bundles.Bundle:
 
 
 def _new_folder(out: Path, env: str) -> Path:
-    base = out / catalogue.folder_name(env)
-    base.mkdir(parents=True, exist_ok=True)
     for number in itertools.count():
+        folder = out.absolute() / catalogue.folder_name(env) / f"try_{number:03d}"
         with contextlib.suppress(FileExistsError):
-            folder = base / f"try_{number:03d}"
-            folder.mkdir()
+            folder.mkdir(parents=True)
             break
-    return folder.absolute()
+    return folder
 
 
 def _print(results: Sequence[TrialResult], as_json: bool, console: Terminal) -> None:
@@ -252,8 +249,8 @@ def _print(results: Sequence[TrialResult], as_json: bool, console: Terminal) -> 
 
 def _print_episodes(result: TrialResult, console: Terminal) -> None:
     # Random actions alone have no policy, and no folder.
-    more = () if result.folder is None else ("played by", "failure")
-    made = table("case", "return", "steps", *more, right=("case", "return", "steps"))
+    numbers, more = ("case", "return", "steps"), () if result.folder is None else ("played by", "failure")
+    made = table(*numbers, *more, right=numbers)
     for one in result.episodes:
         shown = "–" if one.episode_return is None else f"{one.episode_return:.4g}"
         cells = (str(one.case), shown, str(one.length), one.played_by, one_line(one.failure or ""))

@@ -36,8 +36,7 @@ class AgentProcess:
         pass_fds: Sequence[int] = (),
         joins: Sequence[str] = (),
     ) -> AgentProcess:
-        """Starts the program; raises OSError when that fails. `talks`: its stdin is a pipe. `joins`: as in
-        `ending_with_parent`."""
+        """Starts the program, or raises OSError. `talks`: stdin is a pipe. `joins`: as in `ending_with_parent`."""
         process = await asyncio.create_subprocess_exec(
             *ending_with_parent(program, signal.SIGKILL, joins),
             cwd=cwd,
@@ -67,19 +66,19 @@ class AgentProcess:
         if stdin is not None and not stdin.is_closing():
             with contextlib.suppress(BrokenPipeError, ConnectionResetError):
                 stdin.write(line + b"\n")
-                await stdin.drain()
-                return True
+                return await self.drained()
         return False
 
-    async def drained(self) -> None:
-        """Waits until the program has read most of what was written; not for one that has closed its stdin."""
+    async def drained(self) -> bool:
+        """Waits until the program has read most of its input. Returns False when stdin is closed."""
         stdin = self._process.stdin
         if stdin is not None and not stdin.is_closing():
             with contextlib.suppress(BrokenPipeError, ConnectionResetError):
                 await stdin.drain()
+                return True
+        return False
 
     def hang_up(self) -> None:
-        """Closes its stdin."""
         if self._process.stdin is not None:
             self._process.stdin.close()
 

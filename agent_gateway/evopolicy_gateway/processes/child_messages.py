@@ -23,6 +23,13 @@ from evopolicy_gateway.jail.jail import JailOrder
 from evopolicy_gateway.processes import trees as processes
 
 
+class RelayAddress(msgspec.Struct, frozen=True, kw_only=True):
+    """The relay of the run, as its agent sees it."""
+
+    url: str
+    token: str
+
+
 class Event(msgspec.Struct, frozen=True, kw_only=True, tag_field="event"):
     """Child to parent."""
 
@@ -75,10 +82,6 @@ class Progress(Event, frozen=True, kw_only=True, tag="progress"):
     """No further submit is possible, and none runs."""
     cancelled: bool = False
     """The operator has cancelled the run."""
-
-
-class RunClosed(Event, frozen=True, kw_only=True, tag="closed"):
-    """The coordinator has recorded that the run takes no more submits."""
 
 
 class AgentTurn(Event, frozen=True, kw_only=True, tag="turn"):
@@ -153,8 +156,8 @@ class StartAgent(Order, frozen=True, kw_only=True, tag="start_agent"):
 
     agent: str
     """In the form of `--agent`."""
-    workspace: str
-    agent_log: str
+    folder: str
+    """The run's folder."""
     urls: dict[str, str]
     """The `EVOPOLICYGYM_*` variables that hold URLs; the jail lets these URLs through."""
     variables: dict[str, str] = {}
@@ -168,20 +171,13 @@ class StartAgent(Order, frozen=True, kw_only=True, tag="start_agent"):
     """A coding agent's settings: `AgentConfig`."""
     inputs: tuple[AgentInput, ...] = ()
     """Skills and MCP servers with which the run was opened; they need a jail."""
-    model_url: str = ""
-    """Where the relay serves the model's API; empty: the agent reaches the provider itself, with the key."""
-    model_token: str = ""
-    """The key that the relay accepts."""
-    session_file: str | None = None
-    passed_file: str | None = None
-    """`Passed`: gets digests of values that the agent's variables and command line hold."""
+    relay: RelayAddress | None = None
+    """Where the agent finds its model; None: at the provider, with the operator's key."""
     silence_s: float | None = None
     """A program without activity for this long is ended, seconds; None: no such limit."""
     jail: JailOrder | None = None
     """None: not jailed."""
     limits: AgentLimits = AgentLimits()
-    lock: str | None = None
-    """Lock file that the agent supervisor holds while the agent may be alive; it first waits for an earlier holder."""
 
 
 class StartRelay(Order, frozen=True, kw_only=True, tag="start_relay"):
@@ -191,18 +187,15 @@ class StartRelay(Order, frozen=True, kw_only=True, tag="start_relay"):
     """`relay.service.Order`; it has the provider's key."""
 
 
-class HeldTime(Order, frozen=True, kw_only=True, tag="held_time"):
-    """To an agent supervisor: total seconds that submits waited since its start; they count against no agent limit."""
-
-    seconds: float
-
-
 class SubmitsSeen(Order, frozen=True, kw_only=True, tag="submits_seen"):
-    """To an agent supervisor: the number of submits that the agent has requested so far, refused ones included."""
+    """To an agent supervisor: the agent's submits so far."""
 
     asked: int
+    """Their number, refused ones included."""
     running: bool
     """Whether one of them has no answer yet."""
+    held_s: float = 0.0
+    """Seconds that they have waited since the supervisor's start, which count against no limit of the agent."""
 
 
 class StopAgent(Order, frozen=True, kw_only=True, tag="stop_agent"):
@@ -213,7 +206,6 @@ AnyEvent = (
     Ready
     | Waits
     | Progress
-    | RunClosed
     | AgentTurn
     | AgentDoing
     | AgentUsed
@@ -221,7 +213,7 @@ AnyEvent = (
     | AgentEnded
     | ModelBudgetSpent
 )
-AnyOrder = CloseRun | StartAgent | StartRelay | HeldTime | SubmitsSeen | StopAgent
+AnyOrder = CloseRun | StartAgent | StartRelay | SubmitsSeen | StopAgent
 _events: msgspec.json.Decoder[AnyEvent] = msgspec.json.Decoder(AnyEvent)
 _orders: msgspec.json.Decoder[AnyOrder] = msgspec.json.Decoder(AnyOrder)
 
@@ -274,7 +266,6 @@ class Orders:
         threading.Thread(target=self._read, args=(loop,), name="orders", daemon=True).start()
 
     async def next(self) -> AnyOrder | None:
-        """Waits for the next order."""
         return await self._queue.get()
 
     def end(self) -> None:
@@ -303,7 +294,6 @@ class Child(ChildProcess):
     """A running child, started with `talks=True`."""
 
     async def events(self) -> AsyncIterator[AnyEvent]:
-        """Yields the child's events until it ends."""
         assert self._process.stdout is not None
         while data := await self._process.stdout.readline():
             yield event_of(data)

@@ -37,22 +37,19 @@ class AgentClock:
         self._held_s = 0.0
 
     def held(self, seconds: float) -> None:
-        """Sets the total time (seconds) that its submits waited for machines busy with hidden episodes; it does not
-        count."""
+        """Sets the total seconds that its submits waited for hidden episodes, which do not count."""
         self._held_s = max(self._held_s, seconds)
 
-    def left_s(self) -> float:
-        """Seconds left; negative when the time is up."""
-        now = self._now() if self._paused_at is None else self._paused_at
-        return self._limit_s - (now - self._started - self._paused_s - self._held_s)
-
     def used_s(self) -> float:
-        """Seconds used."""
-        return self._limit_s - self.left_s()
+        now = self._now() if self._paused_at is None else self._paused_at
+        return now - self._started - self._paused_s - self._held_s
+
+    def remaining_s(self) -> float:
+        """Seconds until the limit; negative when the time is up."""
+        return self._limit_s - self.used_s()
 
     @contextlib.contextmanager
     def paused(self) -> Iterator[None]:
-        """Pauses the clock inside the `with`."""
         self._paused_at = self._now()
         try:
             yield
@@ -61,10 +58,9 @@ class AgentClock:
             self._paused_at = None
 
     async def run_out(self) -> None:
-        """Returns when the time is up."""
         # Checks repeatedly, as the clock may be paused meanwhile.
-        while (left_s := self.left_s()) > 0:  # noqa: ASYNC110
-            await asyncio.sleep(min(left_s, _POLL_S))
+        while (remaining_s := self.remaining_s()) > 0:  # noqa: ASYNC110
+            await asyncio.sleep(min(remaining_s, _POLL_S))
 
 
 class Activity:
@@ -114,8 +110,7 @@ class Activity:
 
 
 def _last_change(folder: Path) -> float:
-    """Time of the latest change of a file below a folder (Unix time, seconds), except in feedback, which is not the
-    agent's."""
+    """Unix time of the latest change of a file below a folder, except in feedback (not the agent's)."""
     last = 0.0
     for root, folders, files in os.walk(folder):
         if Path(root) == folder and "feedback" in folders:

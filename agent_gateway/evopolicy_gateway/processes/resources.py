@@ -18,6 +18,7 @@ import stat
 import time
 from collections.abc import Iterable, Sequence
 from pathlib import Path
+from typing import Any
 
 import msgspec
 
@@ -53,34 +54,30 @@ class Resources:
             for name, controller in _CONTROLLERS.items()
             if controller in held and getattr(asked, name) is not None
         }
-        limits = msgspec.structs.replace(asked, **{name: None for name in _CONTROLLERS if name not in by})
-        self.fixed_cores = False
+        values: dict[str, Any] = {name: None for name in _CONTROLLERS if name not in by}
+        self.fixed_cores = bool(asked.cpus and "cpus" not in by and jailed)
         """Whether the programs may not choose their cores."""
-        if asked.cpus and "cpus" not in by and jailed:
-            cores = _bind(math.ceil(asked.cpus))
-            limits, by["cpus"] = msgspec.structs.replace(limits, cpus=float(cores)), "affinity"
-            self.fixed_cores = True
+        if self.fixed_cores:
+            values["cpus"], by["cpus"] = _bind(math.ceil(asked.cpus or 0)), "affinity"
         self.own_pids: int | None = None
         """Resource limit for the programs themselves."""
         release = tuple(map(int, re.findall(r"\d+", os.uname().release)[:2]))
         counted = release >= _COUNTED_BY_NAMESPACE and os.getuid() != 0
         if asked.pids and "pids" not in by and jailed and counted:
-            limits, by["pids"] = msgspec.structs.replace(limits, pids=asked.pids), "rlimit"
-            self.own_pids = asked.pids
-        self._now = AgentResources(limits=limits, kept_by=by)
+            self.own_pids = values["pids"] = asked.pids
+            by["pids"] = "rlimit"
+        self._now = AgentResources(limits=msgspec.structs.replace(asked, **values), kept_by=by)
 
     def words(self) -> str:
         """For the operator: the requested limits and the mechanism that keeps each; empty without any."""
-        parts = []
-        for name, form in _WORDS.items():
-            if (asked := getattr(self._asked, name)) is not None:
-                kept = getattr(self._now.limits, name)
-                by = self._now.kept_by.get(name, "no cgroup can be made here: unlimited")
-                parts.append(f"{form.format(kept or asked)} ({by})")
-        return ", ".join(parts)
+        none = "no cgroup can be made here: unlimited"
+        return ", ".join(
+            f"{form.format(getattr(self._now.limits, name) or asked)} ({self._now.kept_by.get(name, none)})"
+            for name, form in _WORDS.items()
+            if (asked := getattr(self._asked, name)) is not None
+        )
 
     def used(self) -> AgentResources:
-        """The present state."""
         now, group = self._now, self._group
         cpu_s, peak = group.cpu_s(), group.peak_bytes()
         if peak is None:
@@ -134,13 +131,13 @@ class Resources:
         return taken if n_bytes > most else ""
 
 
-def _bind(n_cores: int) -> int:
+def _bind(n_cores: int) -> float:
     """Binds this thread to that many of its cores, others for each process; returns their number."""
     cores = sorted(os.sched_getaffinity(0))
     first = os.getpid() % len(cores)
     chosen = (cores[first:] + cores[:first])[:n_cores]
     os.sched_setaffinity(0, chosen)
-    return len(chosen)
+    return float(len(chosen))
 
 
 LEAST_BYTES = 4096
@@ -154,8 +151,7 @@ class TooDeepError(Exception):
 
 
 def used_bytes(folders: Iterable[Path], skipped: Path, pids: Iterable[int]) -> int:
-    """Space of all in `folders` without `skipped`, and of deleted files that `pids` have open. Raises
-    TooDeepError."""
+    """Space of `folders` without `skipped`, and of deleted files open in `pids`. Raises TooDeepError."""
     counted: set[tuple[int, int]] = set()
     total, devices = 0, set()
     for folder in folders:
@@ -173,8 +169,7 @@ def used_bytes(folders: Iterable[Path], skipped: Path, pids: Iterable[int]) -> i
 
 
 def _below(root: Path, skipped: Path, counted: set[tuple[int, int]]) -> int:
-    """Enters folders by descriptors: a path may be longer than the system takes, or lead elsewhere a moment
-    later."""
+    """Enters folders by descriptors: a path may be too long, or lead elsewhere a moment later."""
     total = 0
     stack: list[tuple[int, list[str]]] = []
     try:

@@ -50,27 +50,27 @@ def cpu_below() -> float:
 def end_descendants(
     grace_s: float, *, spare: Collection[int] = (), waited: Collection[int] = ()
 ) -> list[int]:
-    """Ends everything below this process: SIGTERM, then SIGKILL after `grace_s` seconds until no process is left.
+    """Ends everything below this process: SIGTERM, then SIGKILL after `grace_s` seconds until no process remains.
 
     Blocks. `spare`: process ids that stay alive with everything below them. `waited`: ids whose exit status other code
     collects. Returns the ids that survive `KILL_TIMEOUT_S` seconds of killing: none, unless the kernel holds them.
     """
     kept = {*spare, *waited}
-    _signal_all(_left(spare, kept), signal.SIGTERM)
+    _signal_all(_alive(spare, kept), signal.SIGTERM)
     deadline = time.monotonic() + grace_s
-    while _left(spare, kept) and time.monotonic() < deadline:
+    while _alive(spare, kept) and time.monotonic() < deadline:
         _reap(kept)
         time.sleep(_PAUSE_S)
     deadline = time.monotonic() + KILL_TIMEOUT_S
-    while (survivors := _left(spare, kept)) and time.monotonic() < deadline:
-        # Stopped first: a process that forks faster than it is found must not outrun the killing.
+    while (survivors := _alive(spare, kept)) and time.monotonic() < deadline:
+        # Stopped first: a process that forks faster than it is listed must not outrun the killing.
         _signal_all(survivors, signal.SIGSTOP)
-        _signal_all(_left(spare, kept), signal.SIGKILL)
+        _signal_all(_alive(spare, kept), signal.SIGKILL)
         _kill_children(kept)
         _reap(kept)
         time.sleep(_PAUSE_S)
     _reap(kept)
-    return _left(spare, kept)
+    return _alive(spare, kept)
 
 
 def end_orphans(known: Collection[int]) -> list[int]:
@@ -82,7 +82,7 @@ def end_orphans(known: Collection[int]) -> list[int]:
     return end_descendants(0.0, spare=known) if _reaps else []
 
 
-def _left(spare: Collection[int], kept: Collection[int]) -> list[int]:
+def _alive(spare: Collection[int], kept: Collection[int]) -> list[int]:
     """All processes below this one but the dead among `kept`.
 
     The other dead count: in a chain of processes, each of which forks once and ends, all listed processes may be dead
@@ -108,7 +108,6 @@ def _signal_all(pids: list[int], number: signal.Signals) -> None:
 
 
 def _reap(kept: Collection[int]) -> None:
-    """Collects the exit status of dead children, so that no zombies accumulate."""
     me = os.getpid()
     for each in proc.table():
         if each.parent == me and each.dead and each.pid not in kept:

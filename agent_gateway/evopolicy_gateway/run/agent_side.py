@@ -16,12 +16,10 @@ from evopolicy_common.messages.gateway import CANCELLED
 from evopolicy_common.processes.notices import Waiting
 from evopolicy_common.records.secrets import without_keys
 from evopolicy_common.records.words import in_words
-from evopolicy_common.wire.credentials import Credentials
 from evopolicy_gateway.processes import child_messages as messages
-from evopolicy_gateway.processes.child_messages import Progress, Ready
+from evopolicy_gateway.processes.child_messages import Progress
 from evopolicy_gateway.run import model_relay, record
 from evopolicy_gateway.run.children import GatewayProcess, OpenRun, SupervisedAgent
-from evopolicy_gateway.run.operations import Operations
 from evopolicy_gateway.workspace.agents_md import LAST_WORDS_S
 
 T = TypeVar("T")
@@ -31,32 +29,22 @@ END_GRACE_S = 15.0
 class AgentSide:
     """Plays once."""
 
-    def __init__(
-        self,
-        run: OpenRun,
-        operations: Operations,
-        gateway: Credentials,
-        served: asyncio.Future[Ready],
-        *,
-        closed: bool,
-    ) -> None:
-        """`served`, `closed`: as for `GatewayProcess`; a closed run's agent has ended."""
+    def __init__(self, run: OpenRun, *, closed: bool) -> None:
+        """`closed`: the coordinator has closed the run, so that the agent has ended."""
         self._run = run
-        self._operations = operations
-        self._served = served
         self._spent = asyncio.Event()
         """The budget is spent, or the run is cancelled."""
         self._model_spent = asyncio.Event()
         """A request beyond the limits of the run's model was refused."""
         self.cancelled = False
         """The run was cancelled at the coordinator by someone else."""
-        self._gateway = GatewayProcess(run, served, self._on_progress, closed=closed)
-        self.agent = SupervisedAgent(run, gateway)
+        self._gateway = GatewayProcess(run, self._on_progress)
+        self._gateway.closed = closed
+        self.agent = SupervisedAgent(run)
 
     @property
     def closed(self) -> bool:
-        """Whether the coordinator has closed the run, so that the agent has ended."""
-        return self._gateway.closed.is_set()
+        return self._gateway.closed
 
     @property
     def agent_at_work(self) -> bool:
@@ -73,18 +61,19 @@ class AgentSide:
             tasks.append(task := asyncio.create_task(work))
             return task
 
+        served = self._run.served
         relay: model_relay.ModelRelay | None = None
         serving = begin(self._gateway.keep())
         begin(self._follow())
         ends = [begin(self._model_spent.wait()), begin(self._spent.wait())]
         try:
-            up: list[asyncio.Future[Any]] = [serving, self._served]
+            up: list[asyncio.Future[Any]] = [serving, served]
             await asyncio.wait(up, return_when=asyncio.FIRST_COMPLETED)
             if serving.done():
                 serving.result()
-            if not self._served.done():
+            if not served.done():
                 return  # cancelled before it was served
-            ready = self._served.result()
+            ready = served.result()
             self._run.stopwatch.opened()
             relay = model_relay.of_run(self._run, ready, self._model_spent)
             relaying = [] if relay is None else [begin(relay.serve())]
@@ -117,14 +106,13 @@ class AgentSide:
             self._run.stopwatch.closed()
 
     async def _follow(self) -> None:
-        """Prints why the run is not served yet. Ends the agent when the run is cancelled at the coordinator,
-        which the gateway may not learn."""
-        served, waiting = self._served, Waiting()
-        async for progress in self._operations.wait(self._run.run):
-            if not served.done() and progress.env_failure and self._operations.own:
+        """Prints why the run is not served yet; ends the agent of a cancelled run."""
+        run, served, waiting = self._run, self._run.served, Waiting()
+        async for progress in run.operations.wait(run.run):
+            if not served.done() and progress.env_failure and run.operations.own:
                 served.set_exception(BrokenEnvironmentError(progress.env_failure))
             if not served.done() and waiting.worth_saying(progress.waits_for):
-                self._run.note(f"waiting for {progress.waits_for}")
+                run.note(f"waiting for {progress.waits_for}")
             if progress.finished is not None and progress.finished.status == CANCELLED:
                 self.cancelled = True
                 self._spent.set()
@@ -133,11 +121,10 @@ class AgentSide:
         stopwatch = self._run.stopwatch
         stopwatch.reported("gateway", in_flight_s=progress.in_flight_s, feedback_s=progress.feedback_s)
         self._run.watch.progress(self._run.plan.name, progress)
-        before, held_s = stopwatch.times.held_s, stopwatch.held_reported(progress.held_s)
-        if held_s > before:
-            await self.agent.note_held(held_s)
-        asked, running = progress.n_submits + progress.n_rejected, progress.submit_id is not None
-        await self.agent.note_submits(messages.SubmitsSeen(asked=asked, running=running))
+        seen: dict[str, Any] = {"running": progress.submit_id is not None}
+        seen |= {"held_s": stopwatch.held_reported(progress.held_s)}
+        asked = progress.n_submits + progress.n_rejected
+        await self.agent.note_submits(messages.SubmitsSeen(asked=asked, **seen))
         self.cancelled = self.cancelled or progress.cancelled
         if progress.spent:
             self._spent.set()

@@ -15,10 +15,10 @@ from evopolicy_common.processes import child_process, host
 from evopolicy_common.records.run_record import AgentLimits
 from evopolicy_common.wire import credentials
 from evopolicy_common.wire.credentials import Credentials
-from evopolicy_gateway.harnesses.interface.base import RelayAddress
 from evopolicy_gateway.jail.jail import JailOrder
 from evopolicy_gateway.processes import child_messages as messages
-from evopolicy_gateway.processes.child_messages import AgentEnded, Child, Progress, Ready
+from evopolicy_gateway.processes.child_messages import AgentEnded, Child, Progress, Ready, RelayAddress
+from evopolicy_gateway.run.operations import Operations
 from evopolicy_gateway.run.plan import Plan
 from evopolicy_gateway.run.times import Stopwatch
 from evopolicy_gateway.run.watch import View
@@ -35,13 +35,17 @@ class OpenRun(msgspec.Struct, frozen=True, kw_only=True):
     """Its id at the cluster."""
     stopwatch: Stopwatch
     watch: View
+    operations: Operations
+    gateway: Credentials
+    """Of the gateway's role; the jail hides their files."""
+    served: asyncio.Future[Ready]
+    """Gets its result when the gateway serves the agent for the first time."""
 
     @property
     def folder(self) -> RunFolder:
         return self.plan.folder
 
     def note(self, text: str) -> None:
-        """Prints a line about the run."""
         self.watch.note(self.plan.name, text)
 
 
@@ -76,41 +80,31 @@ class Kept:
 class GatewayProcess(Kept):
     """The gateway of one run."""
 
-    def __init__(
-        self,
-        run: OpenRun,
-        served: asyncio.Future[Ready],
-        on_progress: Callable[[Progress], Awaitable[None]],
-        *,
-        closed: bool,
-    ) -> None:
-        """`served`: gets the result when the agent is served for the first time. `closed`: the run is closed."""
+    def __init__(self, run: OpenRun, on_progress: Callable[[Progress], Awaitable[None]]) -> None:
         super().__init__(run)
-        self._served = served
         self._on_progress = on_progress
-        self.closed = asyncio.Event()
-        """Set when the coordinator has closed the run."""
-        if closed:
-            self.closed.set()
+        self.closed = False
+        """Whether the coordinator has closed the run."""
         self._close: messages.CloseRun | None = None
 
     @property
     def is_closing(self) -> bool:
         """Whether the run is closed, or its closing was requested."""
-        return self._close is not None or self.closed.is_set()
+        return self._close is not None or self.closed
 
     async def keep(self) -> None:
         """Runs the gateway until it has closed the run. Raises EvopolicyError when it cannot serve."""
         run, log = self._run, self._run.folder.harness_log
         quick_deaths = 0
-        while not self.closed.is_set():
+        while True:
             started = time.monotonic()
             run.stopwatch.begins("gateway")
             child = await self._start("evopolicy_gateway.cli.serve", str(run.folder.root), "--controlled")
             async for event in child.events():
                 await self._on_event(event)
             code = await child.ended()
-            if self.closed.is_set():
+            if code == 0:
+                self.closed = True
                 return
             quick_deaths = quick_deaths + 1 if time.monotonic() - started < _QUICK_DEATH_S else 0
             if code == _USAGE_ERROR or quick_deaths > _MAX_QUICK_DEATHS:
@@ -131,16 +125,14 @@ class GatewayProcess(Kept):
                 run.watch.held(run.plan.name, event.waits_for)
             case Ready():
                 run.stopwatch.held_reported(event.held_s, event.permit_s)
-                if not self._served.done():
+                if not run.served.done():
                     for text in (*event.notes, *_place_notes(run, event)):
                         run.note(text)
-                    self._served.set_result(event)
+                    run.served.set_result(event)
                 if self._close is not None:
                     await self.close(self._close)
             case Progress():
                 await self._on_progress(event)
-            case messages.RunClosed():
-                self.closed.set()
 
 
 def _place_notes(run: OpenRun, ready: Ready) -> list[str]:
@@ -166,14 +158,12 @@ _ENDLESS = 1 << 62
 class SupervisedAgent(Kept):
     """The agent of one run below its supervisor."""
 
-    def __init__(self, run: OpenRun, gateway: Credentials) -> None:
-        """`gateway`: credentials whose files the jail hides."""
+    def __init__(self, run: OpenRun) -> None:
         super().__init__(run)
-        self._credentials = gateway
         self.survivors: list[int] = []
         """Process ids of the agent that survive being killed."""
         self._submits = messages.SubmitsSeen(asked=0, running=False)
-        """As last reported by the gateway."""
+        """As last reported by the gateway, with the run's `held_s`."""
         self._held_before = 0.0
         """`held_s` of the run when the supervisor was started."""
 
@@ -182,8 +172,7 @@ class SupervisedAgent(Kept):
         return self._child is not None
 
     async def keep(self, ready: Ready, relay: RelayAddress | None, spent: asyncio.Event) -> AgentEnded:
-        """Runs the agent to its end. An agent whose supervisor dies, our failure, resumes its session if it has one,
-        else begins anew in its workspace, unless the budget is `spent`."""
+        """Runs the agent to its end; again after its supervisor's death, unless the budget is `spent`."""
         for _ in range(_MAX_SUPERVISOR_DEATHS):
             ended = await self._keep_once(ready, relay)
             if ended is not None:
@@ -194,16 +183,13 @@ class SupervisedAgent(Kept):
         known = self._run.plan.harness().known()
         return AgentEnded(reason="agent_failed", detail="its agent supervisor died", facts=known)
 
-    async def note_held(self, held_s: float) -> None:
-        """Gives time for which submits waited for hidden episodes back to the agent's clock; `held_s` of the run."""
-        await self.tell(messages.HeldTime(seconds=held_s - self._held_before))
-
     async def note_submits(self, submits: messages.SubmitsSeen) -> None:
+        """Passes them on; the agent's clock gets back the time for which they waited for hidden episodes."""
         self._submits = submits
-        await self.tell(submits)
+        held_s = max(0.0, submits.held_s - self._held_before)
+        await self.tell(msgspec.structs.replace(submits, held_s=held_s))
 
     def tell_survivors(self) -> None:
-        """Prints which processes of the agent survive."""
         pids = ", ".join(map(str, self.survivors))
         self._run.note(
             f"processes of the agent survive being killed ({pids}): the run stays open, and no hidden case"
@@ -217,7 +203,7 @@ class SupervisedAgent(Kept):
         self._held_before = run.stopwatch.times.held_s
         child = await self._start("evopolicy_gateway.agent_supervisor.supervisor")
         await child.tell(self._start_order(ready, relay))
-        await child.tell(self._submits)
+        await self.note_submits(self._submits)
         ended: AgentEnded | None = None
         async for event in child.events():
             match event:
@@ -236,7 +222,7 @@ class SupervisedAgent(Kept):
                 case AgentEnded():
                     ended = event
         await child.ended()
-        # Processes left behind by a supervisor that died have become our children.
+        # Processes that outlived their supervisor have become our children.
         while survivors := await messages.end_orphans():
             if survivors != self.survivors:
                 self.survivors = survivors
@@ -259,8 +245,7 @@ class SupervisedAgent(Kept):
             )
         return messages.StartAgent(
             agent=plan.agent,
-            workspace=str(folder.workspace),
-            agent_log=str(folder.agent_log),
+            folder=str(folder.root),
             urls=ready.variables,
             variables=workspace.variables(shown),
             started_in=str(plan.started_in),
@@ -269,20 +254,17 @@ class SupervisedAgent(Kept):
             prompts=msgspec.to_builtins(plan.texts.prompts),
             inputs=plan.texts.inputs,
             config=None if config is None else msgspec.to_builtins(config),
-            model_url="" if relay is None else relay.url,
-            model_token="" if relay is None else relay.token,
-            session_file=str(folder.session),
-            passed_file=str(folder.passed),
-            lock=str(folder.supervisor_lock),
+            relay=relay,
             jail=jail,
             limits=plan.limits if plan.listener is None else AgentLimits(disk_bytes=_ENDLESS),
         )
 
     def _hidden(self) -> tuple[str, ...]:
         """Folders that the jail never shows: the runs, and the states of the clusters."""
-        known = self._credentials
+        known = self._run.gateway
+        hidden = [self._run.plan.runs.absolute(), credentials.default_state_dir()]
         sockets = [endpoint.partition("/") for endpoint in known.endpoints]
-        states = [str(Path(path).parent.resolve()) for kind, _, path in sockets if kind == "unixsock-stream"]
+        hidden += [Path(path).parent.resolve() for kind, _, path in sockets if kind == "unixsock-stream"]
         if known.tls is not None:
-            states.append(str(Path(known.tls.private_key).parent))
-        return (str(self._run.plan.runs.absolute()), str(credentials.default_state_dir()), *states)
+            hidden.append(Path(known.tls.private_key).parent)
+        return tuple(map(str, hidden))

@@ -24,9 +24,7 @@ import msgspec
 
 from evopolicy_common.errors import ConfigError, RefusedError
 from evopolicy_common.logs import structlog
-from evopolicy_common.records.blobs import BlobStore
 from evopolicy_common.records.open_run import Closed, OpenedRun
-from evopolicy_common.records.policies.trees import Recorder
 from evopolicy_common.refusals import RUN_OVER
 from evopolicy_common.wire import credentials, transport
 from evopolicy_common.wire.http import serving
@@ -69,8 +67,7 @@ class Gateway:
         self._folder = folder
         self._place_of_credentials = connect, credentials_file
         self._on_ready, self._on_change, self._on_wait = on_ready, on_change, on_wait
-        self._alone = alone
-        self._place = place
+        self._alone, self._place = alone, place
         self._stopped = asyncio.Event()
         """Set to leave the run open."""
         self.permit_s = 0.0
@@ -87,53 +84,47 @@ class Gateway:
 
     async def run(self) -> bool:
         """Serves until `tell`; returns whether the run was closed. Raises errors that make serving impossible."""
-        own, known = _load(self._folder, *self._place_of_credentials)
-        run = known.run
+        folder = self._folder
+        own, known = _load(folder, *self._place_of_credentials)
+        run, self._place = known.run, self._place or agent_place(folder)
         async with contextlib.AsyncExitStack() as stack:
-            sock, address = await bind(self._folder)
+            sock, address = await bind(folder)
             stack.callback(sock.close)
-            journal = stack.enter_context(contextlib.closing(Journal(self._folder.journal)))
+            journal = stack.enter_context(contextlib.closing(Journal(folder.journal)))
             linked = stack.enter_async_context(transport.connect(own, timeout_s=None))
             link = await self._unless(self._stopped.wait(), linked)
             if link is None:
                 return False
-            session = CoordinatorClient(link, run, self._folder.state)
+            session = CoordinatorClient(link, run, folder.state)
             try:
                 opened = await self._unless(self._stopped.wait(), session.open())
-                if opened is None or not await self._permitted(session):
+                if opened is None or not await self._permitted(session, self._place):
                     return False
             except RefusedError as error:
                 if error.status not in RUN_OVER:
                     raise
                 log.warning("the run takes no more", status=error.status, why=error.message)
                 return True
-            folder = self._folder
             workspace.stage(folder, opened, address.urls(), known.agents_md)
-            trees = Recorder(folder.workspace, folder.trees, started=folder.start.exists())
-            given = (folder.workspace, journal, BlobStore(folder.blobs), self._changed.set, trees)
-            pipeline = SubmitPipeline(session, opened, *given)
+            pipeline = SubmitPipeline(session, opened, folder, journal, self._changed.set)
             app = make_app(pipeline, address.token, address.bearer)
             http = await stack.enter_async_context(serving(app, sock))
             log.info("serving", run=run, env=opened.env.env, port=address.port)
             self._on_ready(address.urls(), pipeline)
             if not self._orders.done():
-                stack.callback(asyncio.ensure_future(session.keep_permit(self._agent_place)).cancel)
+                stack.callback(asyncio.ensure_future(session.keep_permit(self._place)).cancel)
             try:
                 close = await self._watch(pipeline, http)
                 return close is not None and await self._close(session, journal, pipeline, close)
             finally:
                 await pipeline.stop()
 
-    @property
-    def _agent_place(self) -> AgentPlace:
-        return self._place or agent_place(self._folder)
-
-    async def _permitted(self, session: CoordinatorClient) -> bool:
+    async def _permitted(self, session: CoordinatorClient, place: AgentPlace) -> bool:
         """True when the permit is granted or the run is to be closed; False when ordered to leave the run open."""
         if self._alone:
             self._folder.unwatched.touch(mode=0o600)
         requested_at = time.monotonic()
-        permit = session.permit(self._agent_place, self._on_wait)
+        permit = session.permit(place, self._on_wait)
         try:
             granted = await self._unless(asyncio.shield(self._orders), permit)
         finally:

@@ -191,7 +191,6 @@ class RunLifecycle:
         return wanted
 
     async def _withdraw(self, error: BaseException) -> None:
-        """Cancels the requested run, since its folder is not available."""
         if self.run:
             with contextlib.suppress(EvopolicyError):
                 await self._operations.cancel(self.run)
@@ -218,9 +217,16 @@ class RunLifecycle:
             self._note(f"run {self.run} in {folder.root}")
         self._operations.watched_by(self.run, (folder.lock, folder.supervisor_lock))
         self._stopwatch = Stopwatch(folder.times)
-        opened = OpenRun(plan=self._plan, run=self.run, stopwatch=self._stopwatch, watch=self._watch)
-        known = (opened, self._operations, self._credentials, self.served)
-        self._side = AgentSide(*known, closed=phase != "open")
+        opened = OpenRun(
+            plan=self._plan,
+            run=self.run,
+            stopwatch=self._stopwatch,
+            watch=self._watch,
+            operations=self._operations,
+            gateway=self._credentials,
+            served=self.served,
+        )
+        self._side = AgentSide(opened, closed=phase != "open")
 
     async def _remove_new(self, error: BaseException) -> None:
         if self._new:
@@ -229,19 +235,14 @@ class RunLifecycle:
     async def _agent(self) -> None:
         assert self._side is not None
         await self._side.play()
-
-    async def _score(self) -> None:
-        assert self._side is not None
         if self._side.cancelled:
             await self._tell_gone()
         self._on_agent_gone()
-        self._finished = await self._result()
 
-    async def _result(self) -> RunFinished:
+    async def _score(self) -> None:
         async for progress in self._operations.wait(self.run):
             self._watch.phase(self._plan.name, progress)
-        assert progress.finished is not None
-        return progress.finished
+        self._finished = progress.finished
 
     async def _write(self, why: str | None = None) -> None:
         assert self._finished is not None
@@ -276,7 +277,7 @@ class RunLifecycle:
             async with asyncio.timeout(GIVE_UP_TIMEOUT_S):
                 await self._operations.cancel(self.run)
                 await self._tell_gone()
-                self._finished = await self._result()
+                await self._score()
                 await self._write(why)
 
     async def _tell_gone(self) -> None:

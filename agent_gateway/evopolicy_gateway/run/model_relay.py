@@ -26,12 +26,18 @@ from evopolicy_common.records.open_run import IntendedRun
 from evopolicy_common.records.secrets import Redaction, without_keys
 from evopolicy_common.wire.http import bound
 from evopolicy_gateway.agent_supervisor.supervisor import secrets_in
-from evopolicy_gateway.harnesses.interface.base import RelayAddress
 from evopolicy_gateway.http.server import Address
 from evopolicy_gateway.inputs import own_config
 from evopolicy_gateway.jail.view import confined
 from evopolicy_gateway.processes.agent_process import environment_of
-from evopolicy_gateway.processes.child_messages import AgentDoing, Child, ModelBudgetSpent, Ready, StartRelay
+from evopolicy_gateway.processes.child_messages import (
+    AgentDoing,
+    Child,
+    ModelBudgetSpent,
+    Ready,
+    RelayAddress,
+    StartRelay,
+)
 from evopolicy_gateway.relay.service import Order
 from evopolicy_gateway.run import recorded_agent
 from evopolicy_gateway.run.children import Kept, OpenRun
@@ -85,8 +91,7 @@ class ModelRelay(Kept):
 
 
 def of_run(run: OpenRun, ready: Ready, model_spent: asyncio.Event) -> ModelRelay | None:
-    """The relay for the agent's model, or None where it has none or cannot use one. Prints the limits. `model_spent` is
-    set when the relay refuses a request beyond them."""
+    """The relay for the agent's model, None without one. It sets `model_spent` when it refuses a request."""
     plan, folder, replays = run.plan, run.folder, run.plan.replays
     terms = plan.harness().model
     if terms is None:

@@ -51,10 +51,7 @@ class Operations(OperatorClient):
             raise _settings_error(error) from error
 
     async def wait(self, run: str) -> AsyncIterator[messages.RunProgress]:
-        """Yields the run's progress every few seconds; the last one holds the finished run.
-
-        Logs once why the coordinator accepts no changes.
-        """
+        """Yields the run's progress, the finished run last; logs why the coordinator takes no changes."""
         trouble = ""
         while True:
             progress = await self._progress(run, WAIT_S)

@@ -38,7 +38,7 @@ _OPERATIONAL = frozenset(
 
 
 class Replays(msgspec.Struct, frozen=True, kw_only=True):
-    """The run whose agent is played again: its record, and where its agent found its workspace and services."""
+    """The run whose agent is played again: its record, and the places of its agent's workspace and services."""
 
     folder: Path
     """Of the record of model calls."""
@@ -217,8 +217,7 @@ class Plan(msgspec.Struct, frozen=True, kw_only=True):
         return None
 
     def claim(self) -> None:
-        """Creates the run's empty folder, which no other user may enter; only for the holder of its lock. Raises
-        ConfigError as `check`."""
+        """Creates the run's private empty folder. Raises ConfigError as `check_held`."""
         self.check_held()
         if self.folder.root.exists():
             remove_tree(self.folder.root)

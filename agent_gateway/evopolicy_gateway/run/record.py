@@ -15,6 +15,7 @@ import contextlib
 import os
 import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, cast, get_args
@@ -34,7 +35,7 @@ from evopolicy_common.records.aggregates import mean, std
 from evopolicy_common.records.blobs import BlobStore, write_atomically
 from evopolicy_common.records.code_metrics import TREND, CodeMetrics
 from evopolicy_common.records.journal import GATEWAY_SIDE
-from evopolicy_common.records.open_run import Accepted, AnyEntry, Rejected, Requested
+from evopolicy_common.records.open_run import Accepted, Rejected, Requested
 from evopolicy_common.records.policies import bundles, checkpoints
 from evopolicy_common.records.policies.bundles import Bundle
 from evopolicy_common.records.policies.checkpoints import CheckpointMeta
@@ -60,24 +61,22 @@ _SAME_DIMENSIONS = (
     *("failed_episodes", "hidden_evaluation", "profile", "hidden_cases"),
 )
 """Settings that `run.json` records as its experiment's dimensions, under the same names."""
+_SAME_BOUNDS = ("n_train", "min_episodes_per_submit", "max_episodes_per_submit")
+"""Fields of `Staged` that are dimensions too."""
+_SAME_SETTINGS = ("model", "env", "exp_id", "repeat", "attempt", "sandbox_tier")
+_SAME_RESULTS = ("env_title", "env_family", "run", "hidden_isolation", "audit", "committed")
+"""Fields of the settings and of the finished run that `run.json` has under the same names."""
 
 
-class _Parts:
-    """The parts of a run's directory that were left out."""
-
-    def __init__(self, log: Path) -> None:
-        self._log = log
-        self.left_out: list[str] = []
-
-    @contextlib.contextmanager
-    def part(self, name: str) -> Iterator[None]:
-        """Notes that `name` is left out when a bug ends the `with`."""
-        try:
-            yield
-        except _RESUMABLE:
-            raise
-        except Exception as error:
-            self.left_out.append(f"{name} is left out: {why_failed(error, self._log)}")
+@contextlib.contextmanager
+def _optional(part: str, log: Path, note: Callable[[str], None]) -> Iterator[None]:
+    """Notes that the part of the run's directory is left out when a bug ends the `with`."""
+    try:
+        yield
+    except _RESUMABLE:
+        raise
+    except Exception as error:
+        note(f"{part} is left out: {why_failed(error, log)}")
 
 
 def why_failed(error: Exception, log: Path) -> str:
@@ -103,41 +102,67 @@ async def write(
 ) -> RunRecord:
     """Writes all files and removes the gateway's folder. Raises StorageError when the disk refuses.
 
-    `note` receives each part that was left out. `error`: why this command gave the run up, unless the operator
-    cancelled it.
+    `note` receives each omitted part. `error`: why this command gave the run up, unless the operator cancelled it.
     """
-    parts = _Parts(folder.harness_log)
+    left_out: list[str] = []
+    optional = partial(_optional, log=folder.harness_log, note=left_out.append)
     selected: Bundle | None = None
     code: dict[int, CodeMetrics | None] = {}
     folder.checkpoints.mkdir(exist_ok=True)
-    entries: list[AnyEntry] = []
-    with parts.part("the gateway's journal"):
-        entries = await asyncio.to_thread(_journal, folder)
+    rejected: list[Rejected] = []
+    kept: dict[int, str | None] = {}
+    with optional("the gateway's journal"):
+        rejected, kept = await asyncio.to_thread(_from_journal, folder)
     for submit in finished.submits:
         code[submit.submit_index] = None
-        with parts.part(f"checkpoint {submit_id(submit.submit_index, finished.episode_budget)}"):
-            digest = submit.bundle or _kept(entries).get(submit.submit_index)
+        name = submit_id(submit.submit_index, finished.episode_budget)
+        with optional(f"checkpoint {name}"):
+            digest = submit.bundle or kept.get(submit.submit_index)
             bundle = await asyncio.to_thread(_own_bundle, folder, digest)
             if bundle is None and submit.bundle is not None:
                 bundle = bundles.load(await operations.download(submit.bundle), submit.bundle)
             if submit.submit_index == finished.best_submit_index:
                 selected = bundle
-            code[submit.submit_index] = await asyncio.to_thread(
-                _write_checkpoint, folder, finished, submit, bundle, parts
-            )
+            metrics = None
+            with optional(f"metrics.json of {name}"):
+                metrics = await asyncio.to_thread(checkpoints.measured, bundle)
+            made = (_meta(submit), bundle, metrics)
+            await asyncio.to_thread(checkpoints.write, folder.checkpoints / name, *made)
+            code[submit.submit_index] = metrics
     if selected is not None:
-        with parts.part("the selected policy in workspace/system"):
+        with optional("the selected policy in workspace/system"):
             files = checkpoints.without_metadata(selected.files)
             await asyncio.to_thread(_put_in_place, folder.system, files)
     if error is not None and finished.status == "cancelled":
         finished = msgspec.structs.replace(finished, status="error", error=error)
-    recorded: tuple[schema.Replay, ...] = ()
-    with parts.part("the recordings of held-out episodes"):
-        recorded = await replays.fetch(folder.root, finished, operations)
-    rejected = [entry for entry in entries if isinstance(entry, Rejected)]
-    made = (finished, times, recorded, code, rejected, parts)
-    done = await asyncio.to_thread(_write_record, folder, plan, *made)
-    for text in parts.left_out:
+    known: dict[str, Any] = {"code": code}
+    with optional("the recordings of held-out episodes"):
+        known["replays"] = await replays.fetch(folder.root, finished, operations)
+
+    def finish() -> RunRecord:
+        staged = saved(folder.staged, Staged) if folder.staged.exists() else None
+        if staged is not None:
+            # The agent's log exists even when the agent printed nothing.
+            folder.agent_log.touch()
+        with optional("logs/env.log"):
+            write_atomically(folder.env_log, _env_log(finished))
+        # At the level `scores` the feedback has no rows to count.
+        if plan.settings.feedback != "scores":
+            with optional("the number of steps"):
+                known["transitions"] = count_transitions(folder.feedback)
+        facts = finished.agent
+        with optional("the agent's use of its model"):
+            facts = _complete(folder, plan, facts)
+        whole = msgspec.structs.replace(finished, agent=facts)
+        done = run_record(plan, whole, staged, rejected, times, **known, artifacts=folder.artifacts())
+        write_atomically(folder.run_json, encode_run_record(done))
+        # A later command removes the rest.
+        with contextlib.suppress(OSError):
+            remove_tree(folder.state)
+        return done
+
+    done = await asyncio.to_thread(finish)
+    for text in left_out:
         note(text)
     return done
 
@@ -148,43 +173,31 @@ def run_record(
     staged: Staged | None,
     rejected: Sequence[Rejected],
     times: Times,
-    recorded: tuple[schema.Replay, ...] = (),
+    *,
     code: Mapping[int, CodeMetrics | None] | None = None,
-    artifacts: schema.Artifacts | None = None,
     transitions: dict[str, int] | None = None,
+    **more: Any,
 ) -> RunRecord:
-    """The record of a finished run; pure. `staged` None: the run ended before it had a workspace. `code`: by submit."""
+    """The record of a finished run; pure. `staged` None: no workspace. `code`: by submit."""
     settings = finished.settings
     suite = catalogue.suite_of(settings.env)
-    heldout = finished.heldout_returns
     dimensions = {name: getattr(settings, name) for name in _SAME_DIMENSIONS}
+    dimensions |= {name: getattr(staged, name, 0) for name in _SAME_BOUNDS}
     spent = {f"{name}_s": finished.wall_s.get(name, 0.0) for name in ("queue", "rollout", "finalise")}
     spent |= {name: getattr(times, name) for name in ("feedback_s", "held_s", "permit_s")}
     spent["agent_s"] = max(0.0, times.open_s - times.in_flight_s)
     spent["wall_time_seconds"] = finished.finished_at - finished.created_at
+    same = {name: getattr(settings, name) for name in _SAME_SETTINGS}
+    same |= {name: getattr(finished, name) for name in _SAME_RESULTS}
+    n_heldout = len(finished.heldout_returns or finished.random_heldout_returns)
     return RunRecord(
-        model=settings.model,
-        env=settings.env,
-        env_title=finished.env_title,
-        env_family=finished.env_family,
-        exp_id=settings.exp_id,
-        repeat=settings.repeat,
-        attempt=settings.attempt,
-        run=finished.run,
         agent=_agent(plan, finished.agent, times),
-        sandbox_tier=settings.sandbox_tier,
         jail=plan.jail.recorded,
-        hidden_isolation=finished.hidden_isolation,
         experiment_dimensions=schema.ExperimentDimensions(
             episode_budget=finished.episode_budget,
-            min_episodes_per_submit=staged.min_episodes_per_submit if staged else 0,
-            max_episodes_per_submit=staged.max_episodes_per_submit if staged else 0,
-            n_train=staged.n_train if staged else 0,
             n_validation=settings.n_validation or suite.n_validation,
-            n_heldout=len(heldout or finished.random_heldout_returns)
-            or settings.n_heldout
-            or suite.n_heldout,
-            agents_md=sha256_text(settings.agents_md) if settings.agents_md else "",
+            n_heldout=n_heldout or settings.n_heldout or suite.n_heldout,
+            agents_md=sha256_text(settings.agents_md),
             **dimensions,
         ),
         timing=schema.Timing(
@@ -203,14 +216,12 @@ def run_record(
             for one in rejected
             if one.status in get_args(schema.RejectedStatus)
         ),
-        artifacts=artifacts or schema.Artifacts(),
-        replays=recorded,
         versions=_versions(finished, staged),
-        audit=finished.audit,
-        committed=finished.committed,
         start=settings.start or plan.settings.start,  # an older coordinator keeps none
         replay_of=plan.settings.replay_of,
         trees={str(submit.submit_index): submit.tree for submit in finished.submits if submit.tree},
+        **same,
+        **more,
     )
 
 
@@ -221,16 +232,22 @@ def told_at_close(folder: RunFolder, plan: Plan, facts: dict[str, Any], times: T
     told = {f"agent.{name}": value for name, value in agent.items()}
     told |= {"jail": plan.jail.recorded, "agent.settings": settings}
     if folder.staged.exists():
-        staged = saved(folder.staged, Staged)
-        told["versions.agents_md_hash"] = sha256_text(staged.agents_md_file_hash)
-        told["versions.rules_hash"] = sha256_text(staged.agents_md_hash)
-        told["versions.initial_policy_hash"] = sha256_text(staged.initial_policy_hash)
+        hashes = _workspace_hashes(saved(folder.staged, Staged))
+        told |= {f"versions.{name}": value for name, value in hashes.items()}
     return {name: told[name] for name in GATEWAY_SIDE if name in told}
 
 
+def _workspace_hashes(staged: Staged) -> dict[str, Any]:
+    """The hashes of a staged workspace, by their names in `versions`."""
+    return {
+        "agents_md_hash": sha256_text(staged.agents_md_file_hash),
+        "rules_hash": sha256_text(staged.agents_md_hash),
+        "initial_policy_hash": sha256_text(staged.initial_policy_hash),
+    }
+
+
 def _complete(folder: RunFolder, plan: Plan, facts: dict[str, Any]) -> dict[str, Any]:
-    """The facts about the agent, with those of its settings, its session's file and the relay's ledger: however the run
-    ended."""
+    """Facts about the agent, with those of its settings, its session's file and the relay's ledger."""
     try:
         harness = plan.harness()
     except EvopolicyError:  # its file or its key has gone meanwhile
@@ -259,12 +276,9 @@ def _complete(folder: RunFolder, plan: Plan, facts: dict[str, Any]) -> dict[str,
     known["model_use"] = schema.ModelUse(
         metering="relay",
         limits=limits,
-        requests=used.requests,
         requests_failed=used.failed,
         requests_estimated=used.estimated,
-        models=used.models,
-        other_models=used.other_models,
-        hosted_tools=used.hosted_tools,
+        **{name: getattr(used, name) for name in ("requests", "models", "other_models", "hosted_tools")},
         first_token_s=round(used.first_s / answered, 4) if answered else None,
         rate_limit_s=round(used.wait_s, 3),
         record=plan.record_model,
@@ -276,27 +290,21 @@ def _complete(folder: RunFolder, plan: Plan, facts: dict[str, Any]) -> dict[str,
 
 def _agent(plan: Plan, facts: dict[str, Any], times: Times) -> schema.Agent:
     tokens = facts.get("tokens")
+    own: dict[str, Any] = {"agent": plan.agent}
+    own |= {"wall_limit_s": plan.wall_limit_s, "silence_limit_s": plan.silence_s}
+    if jail := plan.jail.chosen():
+        own["jail"] = jail
     return schema.Agent(
         entry=plan.settings.entry,
-        prompts=sha256_text(plan.settings.prompts) if plan.settings.prompts else "",
+        prompts=sha256_text(plan.settings.prompts),
         inputs=plan.texts.inputs,
         harness=facts.get("harness") or plan.agent.partition(":")[0],
-        cli_version=facts.get("cli_version"),
-        model_string=facts.get("model_string"),
-        settings=without_keys(
-            {
-                "agent": plan.agent,
-                "wall_limit_s": plan.wall_limit_s,
-                "silence_limit_s": plan.silence_s,
-                **({"jail": plan.jail.chosen()} if plan.jail.chosen() else {}),
-                **facts.get("settings", {}),
-            }
-        ),
+        settings=without_keys(own | facts.get("settings", {})),
+        tokens=None if tokens is None else msgspec.convert(tokens, schema.Tokens),
+        resources=times.resources,
         retries=int(facts.get("retries", 0)),
         turns=int(facts.get("turns", 0)),
-        tokens=None if tokens is None else msgspec.convert(tokens, schema.Tokens),
-        model_use=facts.get("model_use"),
-        resources=times.resources,
+        **{name: facts.get(name) for name in ("cli_version", "model_string", "model_use")},
     )
 
 
@@ -304,12 +312,11 @@ def _outcome(
     finished: RunFinished, code: Mapping[int, CodeMetrics | None], transitions: dict[str, int] | None
 ) -> schema.Outcome:
     heldout, reference = finished.heldout_returns, finished.random_heldout_returns
-    completed = finished.status == "completed"
     error = finished.error
     if finished.status == "cancelled" and error is None:
         error = "cancelled by the operator, or because other runs waited for its agent"
         error += " (the coordinator's log: run_cancelled)"
-    best = finished.best_submit_index if completed else None
+    best = finished.best_submit_index if finished.status == "completed" else None
     auxiliary: dict[str, Any] = {
         "code_metrics_best": None if best is None else code.get(best),
         "code_metrics_by_submit": {str(index): metrics for index, metrics in code.items()},
@@ -320,8 +327,9 @@ def _outcome(
         "policy_failures": dict(finished.policy_failures),
         "infrastructure_retries": finished.infrastructure_retries,
         "nondeterministic_results": finished.nondeterministic_results,
-        **({} if transitions is None else {"transitions": transitions}),
     }
+    if transitions is not None:
+        auxiliary["transitions"] = transitions
     random = None
     if reference:
         random = schema.ReferenceScore(
@@ -332,7 +340,7 @@ def _outcome(
         )
     # As published: a run without an ok submit has the score 0.0.
     scored: dict[str, Any] = {"final_score": 0.0} if finished.status == "no_ok_submit" else {}
-    if completed:
+    if finished.status == "completed":
         scored = {
             "final_score": finished.final_score,
             "best_submit_index": best,
@@ -361,56 +369,43 @@ def _versions(finished: RunFinished, staged: Staged | None) -> schema.Versions:
     return schema.Versions(
         harness=f"evopolicy {version('evopolicy')}",
         env=finished.env_version,
-        agents_md_hash=sha256_text(staged.agents_md_file_hash) if staged else "",
         data_train_hash=hashes.get("train.json", cases["train"]),
         data_valid_hash=hashes.get("valid.json", cases["validation"]),
         data_heldout_hash=hashes.get("heldout.json", cases["heldout"]),
-        rules_hash=sha256_text(staged.agents_md_hash) if staged else "",
         cases_hashes=cases,
         fingerprint={} if fingerprint is None else fingerprint.flat(),
         fingerprint_overrides=finished.fingerprint_overrides,
         installations=finished.installations,
         data_secret=finished.split_secret,
-        initial_policy_hash=sha256_text(staged.initial_policy_hash) if staged else None,
         env_deterministic=finished.deterministic,
+        **({"agents_md_hash": ""} if staged is None else _workspace_hashes(staged)),
     )
 
 
 def _own_bundle(folder: RunFolder, digest: str | None) -> Bundle | None:
     """Reads the bundle from the gateway's store; None when it is missing there."""
-    if digest is None or not folder.blobs.is_dir():
-        return None
-    try:
-        return bundles.load(BlobStore(folder.blobs).read(digest), digest)
-    except StorageError:
-        return None
+    if digest is not None and folder.blobs.is_dir():
+        with contextlib.suppress(StorageError):
+            return bundles.load(BlobStore(folder.blobs).read(digest), digest)
+    return None
 
 
-def _journal(folder: RunFolder) -> list[AnyEntry]:
+def _from_journal(folder: RunFolder) -> tuple[list[Rejected], dict[int, str | None]]:
+    """The refused requests, and by submit the digest of a `system/` without a policy, which only the gateway has."""
     if not folder.journal.exists():
-        return []
+        return [], {}
     with contextlib.closing(Journal(folder.journal)) as journal:
-        return journal.entries
-
-
-def _kept(entries: Sequence[AnyEntry]) -> dict[int, str]:
-    """Maps a submit's index to the digest of a `system/` without a policy, which the coordinator does not have."""
-    kept = {entry.key: entry.kept for entry in entries if isinstance(entry, Requested) and entry.kept}
+        entries = journal.entries.values()
+    kept = {entry.key: entry.kept for entry in entries if isinstance(entry, Requested)}
     accepted = [entry for entry in entries if isinstance(entry, Accepted)]
-    return {entry.submit_index: kept[entry.key] for entry in accepted if entry.key in kept}
+    rejected = [entry for entry in entries if isinstance(entry, Rejected)]
+    return rejected, {entry.submit_index: kept.get(entry.key) for entry in accepted}
 
 
-def _write_checkpoint(
-    folder: RunFolder, finished: RunFinished, submit: SubmitRecord, bundle: Bundle | None, parts: _Parts
-) -> CodeMetrics | None:
-    """Writes `checkpoints/submit_NNN/`: the submitted policy, read-only, and its numbers."""
-    name = submit_id(submit.submit_index, finished.episode_budget)
-    metrics = None
-    with parts.part(f"metrics.json of {name}"):
-        metrics = checkpoints.measured(bundle)
+def _meta(submit: SubmitRecord) -> CheckpointMeta:
     requested = len(submit.env_instances)
     charged = 0 if submit.status == CANCELLED else requested
-    meta = CheckpointMeta(
+    return CheckpointMeta(
         submit_index=submit.submit_index,
         submit_time=utc_text(submit.started_at),
         n_episodes_requested=requested,
@@ -420,8 +415,6 @@ def _write_checkpoint(
         mean_return=submit.mean_return,
         val_mean=submit.val_mean,
     )
-    checkpoints.write(folder.checkpoints / name, meta, bundle, metrics)
-    return metrics
 
 
 def _env_log(finished: RunFinished) -> bytes:
@@ -431,10 +424,7 @@ def _env_log(finished: RunFinished) -> bytes:
         ("environment", {"env": settings.env, "version": finished.env_version})
     ]
     for submit in finished.submits:
-        times = {
-            "started_at": utc_text(submit.started_at),
-            "completed_at": utc_text(submit.completed_at),
-        }
+        times = {name: utc_text(getattr(submit, name)) for name in ("started_at", "completed_at")}
         played = {name: getattr(submit, name) for name in ("env_instances", "status", "mean_return")}
         events.append(("train", {"submit_index": submit.submit_index, **times, **played}))
     for index, score in finished.val_scores.items():
@@ -462,37 +452,3 @@ def _put_in_place(system: Path, bundle: Bundle) -> None:
     else:
         system.unlink(missing_ok=True)
     bundles.unpack(bundle, system)
-
-
-def _write_record(
-    folder: RunFolder,
-    plan: Plan,
-    finished: RunFinished,
-    times: Times,
-    recorded: tuple[schema.Replay, ...],
-    code: Mapping[int, CodeMetrics | None],
-    rejected: Sequence[Rejected],
-    parts: _Parts,
-) -> RunRecord:
-    staged = None
-    if folder.staged.exists():
-        staged = saved(folder.staged, Staged)
-        # The agent's log exists even when the agent printed nothing.
-        folder.agent_log.touch()
-    with parts.part("logs/env.log"):
-        write_atomically(folder.env_log, _env_log(finished))
-    transitions = None
-    # At the level `scores` the feedback has no rows to count.
-    if plan.settings.feedback != "scores":
-        with parts.part("the number of steps"):
-            transitions = count_transitions(folder.feedback)
-    with parts.part("the agent's use of its model"):
-        finished = msgspec.structs.replace(finished, agent=_complete(folder, plan, finished.agent))
-    done = run_record(
-        plan, finished, staged, rejected, times, recorded, code, folder.artifacts(), transitions
-    )
-    write_atomically(folder.run_json, encode_run_record(done))
-    # A next command removes what is left.
-    with contextlib.suppress(OSError):
-        remove_tree(folder.state)
-    return done

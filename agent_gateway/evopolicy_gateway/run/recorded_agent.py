@@ -59,8 +59,7 @@ def keep(folder: RunFolder, plan: Plan, replays: Replays) -> None:
 
 
 def plan_of(run: Path, runs: Path, *, trusted: bool = False) -> Plan:
-    """The plan that plays the agent of the run directory again, below `runs`. `trusted`: also one that was written
-    elsewhere. Raises ConfigError."""
+    """The plan that plays the run's agent again. `trusted`: recorded anywhere. Raises ConfigError."""
     folder = RunFolder(run.absolute())
     try:
         kept = msgspec.json.decode(read_regular(folder.replay, _MAX_BYTES), type=Recorded)
@@ -82,10 +81,17 @@ def plan_of(run: Path, runs: Path, *, trusted: bool = False) -> Plan:
     if why := model_record.stopped(folder.root):
         raise ConfigError(f"the record of {run} is not whole, and cannot be replayed: {why}")
     if (config := plan.config) is not None:
-        # The variables in which the agent's settings look for a key.
+        # The variables from which the agent's settings take a key.
         for name in (*config.secret, *(() if config.api else _KEYS.get(config.harness, ()))):
             os.environ.setdefault(name, _NO_KEY)
-    _check_free(replays)
+    for port in (replays.port, replays.model_port):
+        try:
+            bound(LOOPBACK, port).close()
+        except OSError as error:
+            raise ConfigError(
+                f"port {port} on {LOOPBACK}, at which the recorded agent found a service, cannot be used:"
+                f" {error.strerror}; end what listens there (`ss -ltnp` shows it), then replay again"
+            ) from error
     replays = msgspec.structs.replace(replays, folder=folder.model_record)
     settings = msgspec.structs.replace(plan.settings, replay_of=replays.run)
     again = {"overwrite": True, "resume": False, "record_model": "digests"}
@@ -93,8 +99,7 @@ def plan_of(run: Path, runs: Path, *, trusted: bool = False) -> Plan:
 
 
 def outcome(run: Path, plan: Plan) -> str:
-    """The first place in which the replay differs from the run, with versions that differ; empty where they are
-    identical but for these."""
+    """The first difference between replay and run, with versions that differ; empty without one."""
     lines = differences(run, plan.folder.root)
     others = (line for line in lines if not line.startswith((*_OWN, *_VERSIONS)))
     first = _different_request(run, plan.folder) or next(others, "")
@@ -111,17 +116,6 @@ def _different_request(run: Path, again: RunFolder) -> str:
             return f"request {call.n} to {call.api} did not come again"
         again_asked.remove(call.digest)
     return ""
-
-
-def _check_free(replays: Replays) -> None:
-    for port in (replays.port, replays.model_port):
-        try:
-            bound(LOOPBACK, port).close()
-        except OSError as error:
-            raise ConfigError(
-                f"port {port} on {LOOPBACK}, at which the recorded agent found a service, cannot be used:"
-                f" {error.strerror}; end what listens there (`ss -ltnp` shows it), then replay again"
-            ) from error
 
 
 def _code(kept: Recorded) -> str:

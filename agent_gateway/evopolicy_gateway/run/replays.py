@@ -19,8 +19,6 @@ from evopolicy_common.records.blobs import digest_of, write_atomically
 from evopolicy_common.records.run_record import Replay
 from evopolicy_gateway.run.operations import Operations
 
-FOLDER = "replays"
-
 
 async def fetch(root: Path, finished: RunFinished, operations: Operations) -> tuple[Replay, ...]:
     """Writes the recordings below the run directory `root`; returns one `Replay` each, in the split's order."""
@@ -31,11 +29,10 @@ async def fetch(root: Path, finished: RunFinished, operations: Operations) -> tu
     async for outcome in operations.recorded(finished.run, "heldout", index):
         if outcome.video is None:
             continue
-        path = f"{FOLDER}/heldout_{outcome.index:03d}/video.mp4"
+        path = f"replays/heldout_{outcome.index:03d}/video.mp4"
         target = root / path
-        if not (
-            target.is_file() and digest_of(await asyncio.to_thread(target.read_bytes)) == outcome.video.digest
-        ):
+        data = await asyncio.to_thread(target.read_bytes) if target.is_file() else b""
+        if digest_of(data) != outcome.video.digest:
             try:
                 data = await operations.fetch(outcome.video)
             except RefusedError:

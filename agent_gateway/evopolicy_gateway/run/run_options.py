@@ -3,6 +3,9 @@
 
 from __future__ import annotations
 
+import contextlib
+import time
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
@@ -10,22 +13,100 @@ import msgspec
 from msgspec import Meta
 
 from evopolicy_common import catalogue
-from evopolicy_common.errors import ConfigError
+from evopolicy_common.errors import ConfigError, ProtocolError, RequestError
 from evopolicy_common.messages.environment import FailedEpisodes, ObservationForm, PolicyScope, StepLimit
-from evopolicy_common.messages.episode import ResourceLimits, Tier
+from evopolicy_common.messages.episode import LARGEST_LIMIT, LARGEST_LIMITS, ResourceLimits, Tier
 from evopolicy_common.messages.gateway import FeedbackDetail, FinishRule, Profile, SimulationRule, VideoOption
 from evopolicy_common.messages.run_settings import HIDDEN_COUNTS, PUBLISHED, RunSettings, episode_counts
+from evopolicy_common.processes.packages import checked_names, packages_in, policy_versions
 from evopolicy_common.records.model_record import Level
+from evopolicy_common.records.run_files import read_record
 from evopolicy_common.records.run_record import AgentLimits
 from evopolicy_gateway import harnesses
 from evopolicy_gateway.declared import Count, Option, Several
 from evopolicy_gateway.harnesses.interface.agent_config import AgentConfig
 from evopolicy_gateway.processes.clock import SILENCE_S
 from evopolicy_gateway.run import starts, texts
-from evopolicy_gateway.run.options import default_exp_id, limits_of
 from evopolicy_gateway.run.plan import WALL_S, Plan
 from evopolicy_gateway.run.texts import Texts
 from evopolicy_gateway.run_folder.listener import Listener, listener_of
+from evopolicy_gateway.submits.submit_request import Bounds, ids_in
+
+
+def default_exp_id() -> str:
+    """From the time, so that every run has a folder of its own."""
+    return time.strftime("%Y%m%d-%H%M%S")
+
+
+def one_environment(env: str) -> str:
+    """The suite id that `env` names. ConfigError when it names none or several."""
+    env_ids = catalogue.resolve([env])
+    if len(env_ids) != 1:
+        raise ConfigError(f"--env {env} names {len(env_ids)} environments; this command takes one")
+    return env_ids[0]
+
+
+def limits_of(texts: Sequence[str]) -> ResourceLimits:
+    """`NAME=VALUE` texts over the usual limits."""
+    values: dict[str, float] = {}
+    for text in texts:
+        name, equals, value = text.partition("=")
+        if not equals:
+            raise ConfigError(f"--limit {text!r}: use the form NAME=VALUE")
+        try:
+            values[name] = float(value)
+        except ValueError:
+            raise ConfigError(f"--limit {text!r}: {value!r} is not a number") from None
+    return limits_from(values, "--limit ")
+
+
+def limits_from(values: Mapping[str, float], prefix: str) -> ResourceLimits:
+    """Limits by their names over the usual ones. ConfigError for an impossible one; `prefix` begins the error."""
+    usual = ResourceLimits()
+    typed: dict[str, float | int] = {}
+    for name, number in values.items():
+        what = f"{prefix}{name}={number:g}"
+        if name not in usual.__struct_fields__:
+            raise ConfigError(f"{what}: unknown limit; the limits are {', '.join(usual.__struct_fields__)}")
+        if not 0 < number < float("inf"):
+            raise ConfigError(f"{what}: a limit must be a finite number above 0")
+        if number > (most := LARGEST_LIMITS.get(name, LARGEST_LIMIT)):
+            raise ConfigError(f"{what}: {name} can be {most:,} at most")
+        typed[name] = int(number) if isinstance(getattr(usual, name), int) else number
+    return msgspec.structs.replace(usual, **typed)
+
+
+def cases_of(text: str) -> tuple[int, ...]:
+    """Case ids of a text such as `0-3,7`."""
+    # The coordinator knows the number of cases; these bounds only refuse nonsense.
+    bounds = Bounds(n_env_instances=10**6, min_episodes=1, max_episodes=4096, remaining_budget=4096)
+    try:
+        ids = ids_in(text, bounds)
+    except RequestError as error:
+        raise ConfigError(f"--cases {text!r}: {error.message.replace('env_instances', 'it')}") from error
+    if not ids:
+        raise ConfigError(f"--cases {text!r} names no case; use a form such as 0-3,7")
+    return ids
+
+
+def packages_for(policy: Path, requested: Sequence[str] | None) -> tuple[str, ...]:
+    """Packages of `--policy-package`, else of the policy's run. ConfigError for unavailable ones."""
+    if requested:
+        return checked_names(requested)
+    folder = policy.absolute()
+    for run in (folder, *list(folder.parents)[:2]):
+        with contextlib.suppress(OSError, ProtocolError):
+            packages = packages_in(read_record(run).versions.fingerprint)
+            try:
+                policy_versions(packages)
+            except ConfigError as error:
+                raise ConfigError(
+                    f"{run / 'run.json'} names packages of its policies: {error}; --policy-package names others in"
+                    " their place"
+                ) from error
+            return packages
+    return ()
+
 
 Seconds = Annotated[float, Meta(ge=1.0)]
 OF_ONE_RUN = Option(suite=None)
@@ -159,8 +240,7 @@ class RunOptions(PolicyPart, frozen=True, kw_only=True):
     """Space for the agent's workspace, home, and /tmp, in bytes: with more, it is ended. Default: 2e10."""
 
     def texts(self, started_in: Path, config: AgentConfig | None = None) -> Texts:
-        """The texts of the agent, which may have its settings from a suite file. ConfigError naming the file that is
-        wrong."""
+        """The texts of the agent, or of its settings in a suite file. ConfigError names the file."""
         known = config or harnesses.config_of(self.agent, started_in)
         return texts.read(self.agents_md, self.prompts, known, started_in)
 
@@ -186,22 +266,18 @@ class RunOptions(PolicyPart, frozen=True, kw_only=True):
                 f"feedback {chosen['feedback']} shows no videos, and video {self.video} is asked for: leave out one of"
                 " them"
             )
+        chosen |= {name: getattr(self, name) for name in ("repeat", "budget", "video", "replays", "limits")}
         entry = self.entry or harnesses.entry_name(self.agent)
         settings = RunSettings(
             env=env,
             entry=entry,
             model=self.model or entry,
             exp_id=exp_id,
-            repeat=self.repeat,
             notes=notes,
             profile=profile,
-            budget=self.budget,
             min_episodes_per_submit=self.min_episodes,
             max_episodes_per_submit=self.max_episodes,
             sandbox_tier=self.tier,
-            video=self.video,
-            replays=self.replays,
-            limits=self.limits,
             definition=catalogue.pinned(env),
             agent_host=agent_host,
             **chosen,
@@ -225,38 +301,31 @@ class RunOptions(PolicyPart, frozen=True, kw_only=True):
     def plan(
         self, settings: RunSettings, started_in: Path, config: AgentConfig | None = None, **more: Any
     ) -> Plan:
-        """The run with these settings. `config`: as for `texts`; `more`: further fields of the plan. Raises
-        ConfigError."""
+        """The run with these settings. `config`: as for `texts`; `more`: of the plan. Raises ConfigError."""
         known = config or harnesses.config_of(self.agent, started_in)
         if self.start_from is not None:
             origin = starts.find(self.start_from, started_in)
             settings = msgspec.structs.replace(settings, start=origin.start)
             more["start_from"] = f"{origin.folder.root}@{origin.submit}"
+        more |= {
+            name: getattr(self, name) for name in ("agent", "runs", "record_model", "overwrite", "resume")
+        }
         return Plan(
             settings=settings,
             config=config,
             prices=texts.read_prices(self.prices, known, started_in),
             limits=self._agent_limits(),
-            agent=self.agent,
-            runs=self.runs,
             started_in=started_in,
-            record_model=self.record_model,
             wall_limit_s=self.agent_wall_s,
             silence_s=self.agent_silence_s,
-            overwrite=self.overwrite,
-            resume=self.resume,
             **more,
         )
 
     def plans(self, env_ids: list[str], started_in: Path, agent_host: str = "", **more: Any) -> list[Plan]:
         """A plan for each environment, named after it. ConfigError naming the option or file that is wrong."""
         texts, exp_id = self.texts(started_in), self.exp_id or default_exp_id()
-        return [
-            self.plan(
-                self.settings(env, exp_id, agent_host, texts), started_in, name=env, texts=texts, **more
-            )
-            for env in env_ids
-        ]
+        settings = {env: self.settings(env, exp_id, agent_host, texts) for env in env_ids}
+        return [self.plan(settings[env], started_in, name=env, texts=texts, **more) for env in env_ids]
 
 
 class ListenerOptions(msgspec.Struct, frozen=True, kw_only=True):

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
+from typing import NamedTuple
 
 import msgspec
 
@@ -22,7 +23,7 @@ from evopolicy_common.records.run_files import read_record
 from evopolicy_gateway.run_folder.layout import RunFolder, save, saved
 
 
-class StartPoint(msgspec.Struct, frozen=True, kw_only=True):
+class StartPoint(NamedTuple):
     """A start, and where its files are."""
 
     start: Start
@@ -57,17 +58,16 @@ def find(text: str, started_in: Path) -> StartPoint:
     tree, digest = trees.read(folder.root, submit)
     if not (folder.feedback / submit).is_dir():
         raise ConfigError(f"--start-from {text}: the submit has no feedback yet; wait until it is played")
-    start = Start(run=run, submit_index=number, tree=digest)
-    return StartPoint(start=start, folder=folder, submit=submit, tree=tree)
+    return StartPoint(Start(run=run, submit_index=number, tree=digest), folder, submit, tree)
 
 
-def stage(start: StartPoint, folder: RunFolder) -> None:
+def stage(point: StartPoint, folder: RunFolder) -> None:
     """Makes the workspace of a new run. StorageError for a missing content, and where the disk refuses."""
+    start, source, submit, tree = point
     folder.workspace.mkdir()
-    source = start.folder
-    trees.restore(source.root, start.tree, folder.workspace)
-    omitted = trees.copy_history(source.feedback, source.history, start.start.submit_index, folder.history)
+    trees.restore(source.root, tree, folder.workspace)
+    omitted = trees.copy_history(source.feedback, source.history, start.submit_index, folder.history)
     folder.history.mkdir(exist_ok=True)
-    about = {"submit": start.submit, "omitted": omitted}
+    about = {"submit": submit, "omitted": omitted}
     (folder.history / "START.json").write_bytes(msgspec.json.format(msgspec.json.encode(about)) + b"\n")
-    save(folder.start, start.start)
+    save(folder.start, start)

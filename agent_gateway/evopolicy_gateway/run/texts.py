@@ -41,24 +41,20 @@ class Texts(msgspec.Struct, frozen=True, kw_only=True):
 def read(
     agents_md: str | Path | None, prompts: str | Path | None, config: AgentConfig | None, started_in: Path
 ) -> Texts:
-    """The texts in these files, which are relative to `started_in`. A coding agent's own prompts (`config`) count where
-    no file of prompts is given. Raises ConfigError that names the file and the fault."""
-    text = ""
+    """The texts in these files; without `prompts` those of `config`. ConfigError names the file."""
+    text, chosen = "", (None if config is None else config.prompts) or Prompts()
     if agents_md is not None:
         path = shipped.found(agents_md, started_in)
         text = read_text(path)
         check_text(str(path), text, PLACEHOLDERS)
     if prompts is not None:
         chosen = read_prompts(shipped.found(prompts, started_in))
-    else:
-        chosen = (config.prompts if config is not None else None) or Prompts()
     declared = () if config is None else inputs.read(config.skills, config.mcp, started_in)
     return Texts(agents_md=text, prompts=chosen, inputs=tuple(each.recorded for each in declared))
 
 
 def read_prices(file: str | Path | None, config: AgentConfig | None, started_in: Path) -> Prices | None:
-    """The prices of an agent's model from a file with a table for each model; None without a file, or for an agent
-    without a model. Raises ConfigError that names the file and the fault."""
+    """Prices of the agent's model in a file; None without file or settings. ConfigError names the file."""
     if file is None or config is None:
         return None
     path = shipped.found(file, started_in)

@@ -36,13 +36,15 @@ class Times(msgspec.Struct, frozen=True, kw_only=True):
     resources: AgentResources | None = None
     """The agent's use of its machine."""
 
+    def __add__(self, more: Times) -> Times:
+        """With the seconds that another process has counted; waits are counted by the coordinator."""
+        counted = ("agent_s", "open_s", "in_flight_s", "feedback_s")
+        sums = {name: getattr(self, name) + getattr(more, name) for name in counted}
+        resources = more.resources.after(self.resources) if more.resources else self.resources
+        return msgspec.structs.replace(self, **sums, resources=resources)
+
 
 Process = Literal["agent", "gateway"]
-_COUNTED_BY: dict[Process, tuple[str, ...]] = {
-    "agent": ("agent_s", "resources"),
-    "gateway": ("in_flight_s", "feedback_s"),
-}
-"""Fields that processes count from zero."""
 
 
 class Stopwatch:
@@ -55,47 +57,34 @@ class Stopwatch:
         self._base = Times()
         with contextlib.suppress(OSError, *DECODE_ERRORS):
             self._base = msgspec.json.decode(path.read_bytes(), type=Times)
-        self._reported = Times()
-        """The reports of the present processes."""
+        self._reported: dict[Process, Times] = {}
+        """The reports of the present processes, which count from zero."""
         self._opened: float | None = None
 
     @property
     def times(self) -> Times:
-        base, more = self._base, self._reported
-        return msgspec.structs.replace(
-            base,
-            agent_s=base.agent_s + more.agent_s,
-            open_s=base.open_s + (0.0 if self._opened is None else self._now() - self._opened),
-            in_flight_s=base.in_flight_s + more.in_flight_s,
-            feedback_s=base.feedback_s + more.feedback_s,
-            resources=more.resources.after(base.resources) if more.resources else base.resources,
-        )
+        open_s = 0.0 if self._opened is None else self._now() - self._opened
+        return sum(self._reported.values(), self._base + Times(open_s=open_s))
 
     def opened(self) -> None:
-        """The agent's side is open from now on."""
         self._opened = self._now()
 
     def closed(self) -> None:
-        """The agent's side is closed from now on."""
-        self._base, self._opened, self._reported = self.times, None, Times()
+        self._base, self._opened, self._reported = self.times, None, {}
         self.keep()
 
     def begins(self, process: Process) -> None:
-        """A new process starts, which counts from zero."""
-        whole, none, fields = self.times, Times(), _COUNTED_BY[process]
-        self._base = msgspec.structs.replace(self._base, **{name: getattr(whole, name) for name in fields})
-        zero = {name: getattr(none, name) for name in fields}
-        self._reported = msgspec.structs.replace(self._reported, **zero)
+        self._base += self._reported.pop(process, Times())
 
     def reported(self, process: Process, **counts: Any) -> None:
         """Sets counts of a present process; saves those of an agent."""
-        self._reported = msgspec.structs.replace(self._reported, **counts)
+        before = self._reported.get(process, Times())
+        self._reported[process] = msgspec.structs.replace(before, **counts)
         if process == "agent":
             self.keep()
 
     def held_reported(self, held_s: float, permit_s: float = 0.0) -> float:
-        """Sets the run's `held_s` as counted by the coordinator, and adds time spent waiting for a permit; returns the
-        stored `held_s`, which never decreases."""
+        """Sets `held_s`, which never decreases, and adds to `permit_s`; returns the stored `held_s`."""
         base = self._base
         held_s, permit_s = max(base.held_s, held_s), base.permit_s + permit_s
         self._base = msgspec.structs.replace(base, held_s=held_s, permit_s=permit_s)

@@ -18,28 +18,23 @@ _INVALID = b'"action_invalid":true'
 def count_transitions(feedback: Path) -> dict[str, int] | None:
     """Over all recorded train episodes: `steps`, and as `action_invalid` those whose action was outside the action
     space and was repaired. None when the feedback is too large or cannot be read."""
+    counts = {"steps": 0, "action_invalid": 0}
     try:
         if not stat.S_ISDIR(os.lstat(feedback).st_mode):
             return None
-        files = [
-            (path, size)
+        files = {
+            path: size
             for path, size in left_files(feedback)
             if path.name == "trajectory.jsonl" and path.parent.parent.name == "episodes"
-        ]
-        if sum(size for _, size in files) > MAX_READ_BYTES:
+        }
+        if sum(files.values()) > MAX_READ_BYTES:
             return None
-        counts = [_count(path) for path, _ in files]
+        for path in files:
+            # The file may have become a link or a pipe since it was listed.
+            with open_regular(path) as file:
+                for line in file:
+                    counts["steps"] += line.endswith(b"\n")
+                    counts["action_invalid"] += _INVALID in line
     except OSError:
         return None
-    steps, invalid = (sum(column) for column in zip((0, 0), *counts, strict=True))
-    return {"steps": steps, "action_invalid": invalid}
-
-
-def _count(path: Path) -> tuple[int, int]:
-    steps = invalid = 0
-    # The file may have become a link or a pipe since it was listed.
-    with open_regular(path) as file:
-        for line in file:
-            steps += line.endswith(b"\n")
-            invalid += _INVALID in line
-    return steps, invalid
+    return counts

@@ -11,6 +11,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from typing import Any, Self
 
+import msgspec
 from rich.console import RenderableType
 from rich.live import Live
 from rich.table import Table
@@ -32,20 +33,22 @@ PHASES = {
 }
 
 
-class Row:
+_BAR_WIDTH = 12
+
+
+class Row(msgspec.Struct):
     """The known state of one run."""
 
-    def __init__(self) -> None:
-        self.progress: Progress | None = None
-        self.phase: RunProgress | None = None
-        self.action = ""
-        self.held = ""
-        """The reason why it waits to start or to close; also in `waits_for`."""
-        self.waits_for = ""
-        self.state = "waiting"
-        """In a sweep: a state of its index, or `on HOST`; so are the next two."""
-        self.tokens: dict[str, Any] | None = None
-        self.entry: Entry | None = None
+    progress: Progress | None = None
+    phase: RunProgress | None = None
+    action: str = ""
+    held: str = ""
+    """The reason why it waits to start or to close; also in `waits_for`."""
+    waits_for: str = ""
+    state: str = "waiting"
+    """In a sweep: a state of its index, or `on HOST`; so are the next two."""
+    tokens: dict[str, Any] | None = None
+    entry: Entry | None = None
 
 
 class View(ABC):
@@ -61,16 +64,15 @@ class View(ABC):
         self.rows: dict[str, Row] = {}
         self._console = console
         self._drawn = console is not None and console.is_terminal
-        self._last: dict[str, object] = {}
+        self._last: dict[tuple[str, str], object] = {}
 
     @contextlib.contextmanager
     def shown(self) -> Iterator[Self]:
         """Shows the table inside the `with` if the console is a terminal."""
-        shown: contextlib.AbstractContextManager[object] = contextlib.nullcontext()
-        if self._drawn:
-            render = self.render
-            shown = Live(console=self._console, get_renderable=render, refresh_per_second=4, transient=True)
-        with shown:
+        with contextlib.ExitStack() as stack:
+            if self._drawn:
+                how: dict[str, Any] = {"refresh_per_second": 4, "transient": True}
+                stack.enter_context(Live(console=self._console, get_renderable=self.render, **how))
             yield self
 
     @abstractmethod
@@ -88,7 +90,6 @@ class View(ABC):
         return str(details.get("text", ""))
 
     def event(self, kind: str, run: str, **more: Any) -> None:
-        """Reports an event."""
         if self._console is None or (self._drawn and kind not in self.above):
             return
         if text := self.words(kind, run, more):
@@ -97,18 +98,16 @@ class View(ABC):
     # Reports of a run.
 
     def note(self, run: str, text: str) -> None:
-        """Something worth a line."""
         self.row(run)
         self.event("note", run, text=text)
 
     def progress(self, run: str, progress: Progress) -> None:
-        """The train side has progressed."""
         self.row(run).progress = progress
         last = progress.last_submit_id
         if last is not None and self.is_new(run, "submit", last):
-            means = {"mean": progress.last_mean, "best": progress.best_mean}
-            known = {"submit": last, "status": progress.last_status, **means}
-            self.event("submit", run, **known, budget_left=progress.remaining_budget)
+            known = {"submit": last, "status": progress.last_status, "mean": progress.last_mean}
+            known |= {"best": progress.best_mean, "budget_left": progress.remaining_budget}
+            self.event("submit", run, **known)
         self.waits_for(run, progress.waits_for)
 
     def held(self, run: str, what: str) -> None:
@@ -117,22 +116,20 @@ class View(ABC):
         self.waits_for(run, what, "held")
 
     def turn(self, run: str, turn: int, text: str) -> None:
-        """The agent has sent a message."""
         self.row(run).action = first_line(text)
         self.event("turn", run, turn=turn, text=first_line(text))
 
     def doing(self, run: str, doing: AgentDoing) -> None:
         """The agent's activity changed, or it used more tokens."""
-        row = self.row(run)
-        row.action = first_line(doing.action) or row.action
+        row, action = self.row(run), first_line(doing.action)
+        row.action = action or row.action
         if doing.note:
             self.note(run, doing.note)
         if doing.paused_s:
-            seconds, why = round(doing.paused_s), first_line(doing.action)
-            self.event("paused", run, provider=doing.provider, seconds=seconds, why=why)
+            seconds = round(doing.paused_s)
+            self.event("paused", run, provider=doing.provider, seconds=seconds, why=action)
 
     def phase(self, run: str, progress: RunProgress) -> None:
-        """The finalisation has progressed."""
         self.row(run).phase = progress
         if self.is_new(run, "phase", progress.phase):
             self.event("phase", run, phase=progress.phase)
@@ -149,11 +146,8 @@ class View(ABC):
 
     def is_new(self, run: str, kind: str, value: object) -> bool:
         """Whether the last value of that kind for the run differs from `value`."""
-        key = f"{run} {kind}"
-        if self._last.get(key) == value:
-            return False
-        self._last[key] = value
-        return True
+        before, self._last[run, kind] = self._last.get((run, kind)), value
+        return before != value
 
     def _print(self, text: str) -> None:
         if self._console is not None:
@@ -190,9 +184,11 @@ def _cells(row: Row) -> tuple[str, ...]:
     progress = row.progress
     if progress is None:
         return ("", "", "", f"waiting for {row.held}" if row.held else "starting")
-    used = progress.episode_budget - progress.remaining_budget
+    budget = progress.episode_budget
+    used = budget - progress.remaining_budget
+    filled = round(_BAR_WIDTH * used / budget) if budget else 0
     return (
-        f"{_bar(used, progress.episode_budget)} {used}/{progress.episode_budget}",
+        f"{'━' * filled}{'╌' * (_BAR_WIDTH - filled)} {used}/{budget}",
         str(progress.n_submits),
         "" if progress.best_mean is None else f"{progress.best_mean:.4g}",
         _now(row, progress),
@@ -203,18 +199,15 @@ def _now(row: Row, progress: Progress) -> str:
     if row.held:
         return f"waiting for {row.held}"
     if row.phase is not None:
-        done = f" {row.phase.done}/{row.phase.total}" if row.phase.total else ""
-        waits = f", waiting for {row.phase.waits_for}" if row.phase.waits_for else ""
-        return PHASES[row.phase.phase] + done + waits
-    if progress.submit_id is not None:
-        waits = f", waiting for {progress.waits_for}" if progress.waits_for else ""
-        return f"{progress.submit_id}: {progress.n_done}/{progress.n_episodes} episodes{waits}"
-    return f"agent at work{f': {row.action}' if row.action else ''}"
-
-
-def _bar(part: int, whole: int, width: int = 12) -> str:
-    filled = round(width * part / whole) if whole else 0
-    return "━" * filled + "╌" * (width - filled)
+        doing, waits_for = PHASES[row.phase.phase], row.phase.waits_for
+        if row.phase.total:
+            doing += f" {row.phase.done}/{row.phase.total}"
+    elif progress.submit_id is not None:
+        doing = f"{progress.submit_id}: {progress.n_done}/{progress.n_episodes} episodes"
+        waits_for = progress.waits_for
+    else:
+        return f"agent at work{f': {row.action}' if row.action else ''}"
+    return doing + (f", waiting for {waits_for}" if waits_for else "")
 
 
 def first_line(text: str) -> str:

@@ -49,7 +49,7 @@ class AtWork:
 
     @contextlib.contextmanager
     def on(self, key: str, index: int) -> Iterator[None]:
-        """Marks the episode as in work inside the `with`. Thread-safe."""
+        """Marks the episode inside the `with`. Thread-safe."""
         with self._lock:
             if not self._free:
                 self._free.append(self._n_records * self._RECORD)
@@ -75,10 +75,8 @@ class Journal:
         self._path = path
         self.at_work = AtWork(path.with_name("at-work"))
         """The episodes whose files are being made."""
-        self.entries: list[AnyEntry] = []
-        """The entries found when it was opened, oldest first."""
-        self.places: list[int] = []
-        """File offsets of these entries, for `read`."""
+        self.entries: dict[int, AnyEntry] = {}
+        """Its entries when it was opened, oldest first, by their file offsets for `read`."""
         fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
         self._file = os.fdopen(fd, "r+b", buffering=0)
         try:
@@ -103,15 +101,10 @@ class Journal:
         return start
 
     def read(self, place: int) -> AnyEntry:
-        """Returns the entry at a file offset."""
         with self._path.open("rb") as file:
             file.seek(place)
             entry: AnyEntry = entry_decoder.decode(file.readline())
             return entry
-
-    def forget(self) -> None:
-        """Drops the entries found when it was opened, to free memory."""
-        self.entries, self.places = [], []
 
     def close(self) -> None:
         self._file.close()
@@ -123,8 +116,7 @@ class Journal:
         place = 0
         for number, line in enumerate(data[:whole].splitlines(keepends=True), start=1):
             try:
-                self.entries.append(entry_decoder.decode(line))
-                self.places.append(place)
+                self.entries[place] = entry_decoder.decode(line)
                 place += len(line)
             except DECODE_ERRORS as error:
                 raise StorageError(f"{self._path}, line {number}, is damaged: {error}") from error

@@ -180,15 +180,11 @@ def folder_of(path: Path) -> RunFolder:
     return RunFolder(path.absolute())
 
 
-def _digits(episode_budget: int) -> int:
-    return max(3, len(str(episode_budget)))
-
-
-def submit_id(index: int, episode_budget: int) -> str:
+def submit_id(index: int, episode_budget: int, prefix: str = "submit") -> str:
     """`submit_NNN`: the name of a submit in answers, and of its folder."""
-    return f"submit_{index:0{_digits(episode_budget)}d}"
+    return f"{prefix}_{index:0{max(3, len(str(episode_budget)))}d}"
 
 
 def episode_name(global_index: int, episode_budget: int) -> str:
     """`ep_XXX`: the name of an episode, counted over all attempted episodes of the run."""
-    return f"ep_{global_index:0{_digits(episode_budget)}d}"
+    return submit_id(global_index, episode_budget, "ep")

@@ -83,8 +83,7 @@ def check_agent(agent: str, listener: Listener | None) -> None:
 
 
 def agent_host_of(agent: str, named: str | None) -> str:
-    """Parses `--agent-host`: a kernel's boot id or `ELSEWHERE`; empty for None. Raises ConfigError for anything else,
-    and for an agent that is started here."""
+    """Parses `--agent-host`: boot id or `ELSEWHERE`; empty for None. ConfigError, also for local agents."""
     if named is None:
         return ""
     if agent != AGENT:
@@ -121,10 +120,9 @@ def ends_unseen(folder: RunFolder) -> bool:
 
 
 def _agent_host(folder: RunFolder) -> str:
-    try:
+    with contextlib.suppress(FileNotFoundError):
         return saved(folder.intended, IntendedRun).settings.agent_host
-    except FileNotFoundError:
-        return ""
+    return ""
 
 
 def place_notice(agent_host: str, root: Path) -> str:

@@ -50,7 +50,6 @@ def check_free(lock: Path, what: Path) -> None:
 
 
 async def until_free(lock: Path, what: Path) -> None:
-    """Waits until the lock is free."""
     while True:
         try:
             return check_free(lock, what)

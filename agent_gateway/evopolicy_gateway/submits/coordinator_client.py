@@ -73,8 +73,8 @@ class CoordinatorClient:
         Raises ConfigError when the coordinator's version does not support permits.
         """
         wait_s = FIRST_PERMIT_WAIT_S
+        known = self._known | msgspec.structs.asdict(place)
         while True:
-            known = self._known | msgspec.structs.asdict(place)
             message = messages.RequestPermit(**known, wait_s=wait_s)
             try:
                 permit = await self._ask("permit", message, messages.Permit, wait_s=wait_s)
@@ -111,7 +111,6 @@ class CoordinatorClient:
             return None
 
     async def upload(self, digest: str, data: bytes) -> None:
-        """Uploads a bundle to the coordinator."""
         await self._requests.upload(*self._sender, digest, data)
 
     async def submit(self, request: Requested) -> messages.SubmitAccepted:
@@ -123,17 +122,14 @@ class CoordinatorClient:
         )
         return await self._ask("submit", message, messages.SubmitAccepted)
 
-    async def results(
-        self, submit_index: int, cursor: int, wait_s: float = RESULTS_WAIT_S
-    ) -> messages.ResultsPage:
+    async def results(self, submit_index: int, cursor: int, wait_s: float) -> messages.ResultsPage:
         """Returns the submit's results since `cursor`, within `wait_s` seconds; the page may be empty."""
         asked: dict[str, Any] = {"submit_index": submit_index, "cursor": cursor, "wait_s": wait_s}
         question = messages.ResultsRequest(**self._known, **asked)
         return await self._ask("results", question, messages.ResultsPage, wait_s=wait_s)
 
     async def fetch(self, ref: BlobRef) -> bytes:
-        """Returns the bytes that `ref` names, verified. Large ones are in an unnamed temporary file, not in
-        memory."""
+        """Returns the bytes that `ref` names, verified; large ones are in an unnamed temporary file."""
         if ref.inline is not None or ref.size <= LARGE_BYTES:
             return await self._requests.fetch(*self._sender, ref)
         with tempfile.TemporaryFile(dir=self._scratch) as file:

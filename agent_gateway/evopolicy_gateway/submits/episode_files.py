@@ -26,10 +26,6 @@ from evopolicy_common.records.episodes.npz import read_arrays
 from evopolicy_common.records.episodes.rendered import MAX_OBSERVATIONS_BYTES, OBSERVATIONS, ROWS, SINGLE
 from evopolicy_gateway.submits.formatting import cut_text, failure_line
 
-FEEDBACK_ERROR = "feedback_error"
-"""Category of the line in `error.txt` that reports an infrastructure failure; the policy did not fail."""
-
-
 _NO_MESSAGE = "messages of a policy are left out at this run's level of feedback"
 
 LEFT_OUT_FIRST = ("video.mp4", "observations.npz", "observations.npy", "trajectory.jsonl")
@@ -111,13 +107,10 @@ def episode_files(
 
 
 def set_aside_files(episode: EpisodeFeedback, why: str, *, at: float, texts: bool = True) -> dict[str, bytes]:
-    """Returns the files of an episode whose trajectory cannot be written: all others, and the reason.
-
-    `texts`: whether these include the policy's own texts (`shows_texts`).
-    """
+    """The files of an episode without its trajectory, and why. `texts`: with the policy's own texts."""
     files = _text_files(episode, at, whole=texts)
     failure = PolicyFailure(
-        category=FEEDBACK_ERROR,  # type: ignore[arg-type]  # not the policy's
+        category="feedback_error",  # type: ignore[arg-type]  # an infrastructure failure, not the policy's
         message=f"{why}; the episode's return counts",
         step_index=None,
     )
@@ -135,10 +128,7 @@ def _text_files(episode: EpisodeFeedback, at: float, *, whole: bool) -> dict[str
 
 
 MOST_INLINE_BYTES = 4096
-STACKED = "observations.npy"
-
 _rows = msgspec.json.Decoder(dict[str, msgspec.Raw])
-_NULL = msgspec.Raw(b"null")
 
 
 def as_published(files: dict[str, bytes]) -> dict[str, bytes]:
@@ -152,25 +142,35 @@ def as_published(files: dict[str, bytes]) -> dict[str, bytes]:
     if not rows or not columns:
         return files
     columns = {name: _small(column) for name, column in columns.items()}
+    single = columns[SINGLE] if list(columns) == [SINGLE] else None
     kept = {name: data for name, data in files.items() if name not in (ROWS, OBSERVATIONS)}
-    if sum(column.nbytes for column in columns.values()) <= MOST_INLINE_BYTES:
-        shown = [msgspec.Raw(msgspec.json.encode(_row(columns, t))) for t in range(len(rows))]
-        return kept | {ROWS: _text(rows, shown if beside is not None else [row["obs"] for row in rows])}
-    file = io.BytesIO()
-    if list(columns) == [SINGLE]:
-        np.save(file, columns[SINGLE])
+    if sum(column.nbytes for column in columns.values()) > MOST_INLINE_BYTES:
+        file = io.BytesIO()
+        if single is not None:
+            np.save(file, single)
+        else:
+            np.savez_compressed(file, **columns)
+        kept[OBSERVATIONS if single is None else "observations.npy"] = file.getvalue()
+        shown = [msgspec.Raw(b"null")] * len(rows)
+    elif beside is None:
+        shown = [row["obs"] for row in rows]
     else:
-        np.savez_compressed(file, **columns)
-    name = STACKED if list(columns) == [SINGLE] else OBSERVATIONS
-    return kept | {ROWS: _text(rows, [_NULL] * len(rows)), name: file.getvalue()}
+        values = {name: column.tolist() for name, column in columns.items()}
+        steps = [{name: values[name][t] for name in values} for t in range(len(rows))]
+        shown = [msgspec.Raw(msgspec.json.encode(step if single is None else step[SINGLE])) for step in steps]
+    kept[ROWS] = b"".join(
+        msgspec.json.encode({**row, "obs": obs}) + b"\n" for row, obs in zip(rows, shown, strict=True)
+    )
+    return kept
 
 
 def _columns(obs: list[Any]) -> dict[str, np.ndarray[Any, Any]]:
     """The stacked observations by name; empty if they do not stack."""
     if not obs:
         return {}
-    names = list(obs[0]) if isinstance(obs[0], dict) else [SINGLE]
-    parts = {name: [each[name] for each in obs] if isinstance(obs[0], dict) else obs for name in names}
+    parts = {SINGLE: obs}
+    if isinstance(obs[0], dict):
+        parts = {name: [each[name] for each in obs] for name in obs[0]}
     try:
         columns = {name: np.array(part) for name, part in parts.items()}
     except ValueError:
@@ -182,15 +182,3 @@ def _small(column: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
     if column.dtype.kind in "iu" and column.size and column.min() >= 0 and column.max() <= 255:
         return column.astype(np.uint8)
     return column
-
-
-def _row(columns: dict[str, np.ndarray[Any, Any]], t: int) -> Any:
-    if list(columns) == [SINGLE]:
-        return columns[SINGLE][t].tolist()
-    return {name: column[t].tolist() for name, column in columns.items()}
-
-
-def _text(rows: list[dict[str, msgspec.Raw]], obs: list[msgspec.Raw]) -> bytes:
-    return b"".join(
-        msgspec.json.encode({**row, "obs": shown}) + b"\n" for row, shown in zip(rows, obs, strict=True)
-    )

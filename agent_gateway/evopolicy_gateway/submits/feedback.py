@@ -2,7 +2,7 @@
 
 - Everything in a folder is durable before the rename; `summary.json` is written last.
 - A folder without `.partial` is complete and never changes.
-- Whatever an agent may have put in the way is removed, never followed.
+- Anything that an agent has put in the way is removed, never followed.
 - A `.partial` folder need not be durable, because it is rewritten after a crash: one flush of the file system
   at the end covers all its files.
 """
@@ -101,7 +101,6 @@ class SubmitTree:
             os.rename(hidden, shown)
 
     def drop_episode(self, name: str) -> None:
-        """Removes an episode's folder, if it exists."""
         _remove(self._partial / "episodes" / name)
 
     def commit(self, summary: bytes, errors: bytes | None) -> None:
@@ -117,37 +116,28 @@ class SubmitTree:
 
 
 class Linger:
-    """The pauses of one submit: each is half of the time that the episodes left will take at the pace so far.
+    """The pauses of one submit: each is half of the time that the remaining episodes take at the pace so far.
 
-    So a submit needs few pages, and its last episodes are not kept waiting.
+    So a submit needs few pages, and its last episodes do not wait.
     """
 
     def __init__(self, n_episodes: int, now: float) -> None:
         """`now`, here and below: monotonic time, seconds."""
-        self._n = n_episodes
-        self._began = now
-        self._first: tuple[int, float] | None = None
+        self._n, self._began = n_episodes, now
+        self._first = 0, now
         """Episodes of the first page, and the time of its arrival."""
 
     def pause_s(self, n_done: int, now: float) -> float:
         """Seconds to wait once `n_done` episodes are written."""
-        if not n_done:
-            return 0.0
-        if self._first is None:
+        if not self._first[0]:
             self._first = n_done, now
         n_first, at = self._first
         if n_done == n_first:
             # The pace is not known yet.
-            pause_s = min(FIRST_LINGER_S, (now - self._began) / 2)
+            pause_s = min(FIRST_LINGER_S, (now - self._began) / 2) if n_done else 0.0
         else:
             pause_s = (self._n - n_done) * (now - at) / (n_done - n_first) / 2
         return min(pause_s, LONGEST_LINGER_S) if pause_s >= SHORTEST_LINGER_S else 0.0
-
-
-def _is_whole(episode: EpisodeFeedback) -> bool:
-    """Whether the result page contains the episode's bytes."""
-    refs = (episode.trajectory, episode.video)
-    return all(ref is None or ref.inline is not None for ref in refs)
 
 
 @dataclass
@@ -192,9 +182,13 @@ class Collector:
         wanted = [episode for episode in page.episodes if episode.index not in self.scores]
         # Episodes over which a gateway died are written alone, so that no other episode is blamed. One thread
         # call writes all others that came with the page; the rest are written as their bytes arrive.
-        suspects = [each for each in wanted if self.machine.deaths[self.accepted.key, each.index]]
-        whole = [episode for episode in wanted if _is_whole(episode) and episode not in suspects]
-        others = [episode for episode in wanted if not _is_whole(episode) and episode not in suspects]
+        suspects: list[EpisodeFeedback] = []
+        whole: list[EpisodeFeedback] = []
+        others: list[EpisodeFeedback] = []
+        for each in wanted:
+            inline = all(ref is None or ref.inline is not None for ref in (each.trajectory, each.video))
+            died = self.machine.deaths[self.accepted.key, each.index]
+            (suspects if died else whole if inline else others).append(each)
 
         async def write(episodes: list[EpisodeFeedback]) -> None:
             async with gate:

@@ -46,17 +46,10 @@ def failure_text(failure: PolicyFailure | None) -> str | None:
 
 def failure_line(failure: PolicyFailure, at: float) -> bytes:
     """A failure as a line of an episode's `error.txt`, cut to 64 KiB. `at`: Unix time, seconds."""
-    line: dict[str, Any] = {
-        "schema_version": SCHEMA_VERSION,
-        "timestamp": utc_text(at),
-        "category": failure.category,
-        "message": failure.message,
-        "traceback": failure.traceback,
-        "step_index": failure.step_index,
-    }
+    more: dict[str, Any] = {"step_index": failure.step_index}
     if failure.limit is not None:
-        line |= {"limit": failure.limit, "used": failure.used}
-    return _fitting(line)
+        more |= {"limit": failure.limit, "used": failure.used}
+    return _line(at, failure.category, failure.message, failure.traceback, **more)
 
 
 def verdict_line(
@@ -74,12 +67,7 @@ def verdict_line(
         same = failure.category == status or failure.category in NO_POLICY
         own = failure.message if same else f"{failure.category}: {failure.message}"
         details = failure.traceback
-    line: dict[str, Any] = {
-        "schema_version": SCHEMA_VERSION,
-        "timestamp": utc_text(at),
-        "category": status,
-    }
-    return _fitting(line | {"message": own, "traceback": details if traceback else None})
+    return _line(at, status, own, details if traceback else None)
 
 
 def summary_bytes(
@@ -109,10 +97,11 @@ def summary_bytes(
     returns = tuple(score.episode_return for score in ordered)
     components = tuple(score.reward_components for score in ordered)
     with_components = played and any(components)
-    names = list(dict.fromkeys(name for parts in components for name in parts))
+    names = dict.fromkeys(name for parts in components for name in parts)
     means = {name: mean([parts.get(name, 0.0) for parts in components]) for name in names}
     lengths = tuple(score.length for score in ordered)
     solved = tuple(score.success for score in ordered)
+    errors = _where(ordered, None)
     summary = Summary(
         schema_version=SCHEMA_VERSION,
         submit_index=submit_index,
@@ -133,11 +122,11 @@ def summary_bytes(
         episode_lengths=lengths if played else None,
         mean_episode_length=mean(lengths) if played else None,
         timeouts=_where(ordered, TIME_LIMITS) if played else None,
-        errors=_where(ordered, None) if played else None,
+        errors=errors if played else None,
         reward_components_mean=means if with_components else None,
         reward_components_per_episode=components if with_components else None,
         successes=solved if played and None not in solved and solved else None,
-        policy_failures=len(_where(ordered, None)) if played else None,
+        policy_failures=len(errors) if played else None,
         warning=_warning(ordered, observations, ends=not ok, messages=messages) if played else None,
     )
     fields = plain(msgspec.to_builtins(summary))
@@ -151,8 +140,7 @@ def summary_bytes(
 def _warning(
     scores: Sequence[EpisodeFeedback], observations: ObservationForm, *, ends: bool, messages: bool
 ) -> str | None:
-    """The warning to the agent about policy failures in a played submit; None when no episode failed. `ends`: whether
-    such an episode ended."""
+    """The warning about policy failures in a played submit. `ends`: such an episode ended."""
     failures = [score.failure for score in scores if score.failure is not None]
     if not failures:
         return None
@@ -181,14 +169,15 @@ def _where(scores: Sequence[EpisodeFeedback], categories: frozenset[str] | None)
     )
 
 
-def _fitting(line: dict[str, Any]) -> bytes:
-    """The line, its traceback and then its message cut to fit 64 KiB. A traceback keeps its end, which tells most."""
+def _line(at: float, category: str, message: str, traceback: str | None, **more: Any) -> bytes:
+    """A line of JSON; to fit 64 KiB its traceback (from the start) and then its message are cut."""
+    line: dict[str, Any] = {"schema_version": SCHEMA_VERSION, "timestamp": utc_text(at), "category": category}
+    line |= {"message": message, "traceback": traceback, **more}
     for field in ("traceback", "message"):
         text = line[field] or ""
         keep = len(text)
         while keep and len(json_bytes(line)) >= MAX_TEXT_BYTES:
             keep = keep * 3 // 4
-            line[field] = (
-                f"[cut] {text[len(text) - keep :]}" if field == "traceback" else f"{text[:keep]} [cut]"
-            )
+            end = f"[cut] {text[len(text) - keep :]}"
+            line[field] = end if field == "traceback" else f"{text[:keep]} [cut]"
     return json_bytes(line) + b"\n"

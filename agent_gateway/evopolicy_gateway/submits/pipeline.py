@@ -14,17 +14,17 @@ import time
 import uuid
 from collections.abc import Callable
 from functools import partial
-from pathlib import Path
 from typing import TypeVar
 
 from evopolicy_common.errors import RefusedError, RequestError, StorageError
 from evopolicy_common.logs import structlog
-from evopolicy_common.messages.gateway import RunOpened, RunState, SubmitAccepted, SubmitDone
+from evopolicy_common.messages.gateway import RunOpened, SubmitAccepted, SubmitDone
 from evopolicy_common.records.blobs import BlobStore
 from evopolicy_common.records.open_run import Accepted, AnyEntry, Died, Requested, Settled
 from evopolicy_common.records.policies.trees import Recorder
 from evopolicy_common.refusals import Refusal
 from evopolicy_gateway.run_folder.journal import Journal
+from evopolicy_gateway.run_folder.layout import RunFolder
 from evopolicy_gateway.submits import snapshots
 from evopolicy_gateway.submits.coordinator_client import CoordinatorClient
 from evopolicy_gateway.submits.feedback import Collector, SubmitTree
@@ -44,23 +44,21 @@ class SubmitPipeline:
         self,
         client: CoordinatorClient,
         run: RunOpened,
-        workspace: Path,
+        folder: RunFolder,
         journal: Journal,
-        blobs: BlobStore,
         on_change: Callable[[], None],
-        trees: Recorder,
     ) -> None:
-        """`on_change` is called after every change that a watcher shows. `trees` records the workspace at submits."""
-        self.machine = TicketMachine(run, zip(journal.entries, journal.places, strict=True))
-        journal.forget()
+        """`on_change` is called after every change that a watcher shows."""
+        self.machine = TicketMachine(run, journal.entries)
+        journal.entries = {}  # to free memory
         self.fatal: asyncio.Future[None] = asyncio.get_running_loop().create_future()
         """Fails with the error that ends this process."""
         self._client = client
-        self._workspace = workspace
+        self._folder = folder
         self._journal = journal
-        self._blobs = blobs
+        self._blobs = BlobStore(folder.blobs)
         self._on_change = on_change
-        self._trees = trees
+        self._trees = Recorder(folder.workspace, folder.trees, started=folder.start.exists())
         self._news = asyncio.Event()
         """Set, and replaced, at the next change of the machine."""
         self._uploaded: str | None = None
@@ -98,7 +96,6 @@ class SubmitPipeline:
             await self._note(entry)
 
     async def until(self, reached: Callable[[], bool]) -> None:
-        """Waits for a state of the machine."""
         while not reached():
             await self._news.wait()
 
@@ -110,8 +107,8 @@ class SubmitPipeline:
         assert isinstance(entry, Settled)
         return entry.summary.encode()
 
-    async def refresh(self) -> RunState:
-        """Returns the coordinator's state of the run; the last known one when it does not answer at once."""
+    async def refresh(self) -> None:
+        """Updates the state of the run, unless the coordinator does not answer at once."""
         try:
             state = await self._client.state()
         except RefusedError as error:
@@ -121,10 +118,8 @@ class SubmitPipeline:
         else:
             if state is not None and self.machine.hear(state):
                 self._changed()
-        return self.machine.state
 
     async def idle(self) -> None:
-        """Waits until no submit runs."""
         while self._task is not None and not self._task.done():
             await asyncio.wait([self._task])
 
@@ -159,12 +154,13 @@ class SubmitPipeline:
         try:
             match effect:
                 case "snapshot":
-                    system, published = self._workspace / "system", machine.run.profile != "own"
-                    take = partial(snapshots.take, system, self._blobs, published=published)
-                    snapshot = await self._on_disk(take)
-                    given = (ticket.submit_id, self._trees, self._blobs, self._workspace.parent)
-                    snapshot = await asyncio.to_thread(snapshots.record_tree, snapshot, *given)
-                    return machine.snapshotted(snapshot)
+                    given = self._folder.system, self._blobs
+                    published = machine.run.profile != "own"
+                    snapshot = await self._on_disk(partial(snapshots.take, *given, published=published))
+                    more = (ticket.submit_id, self._trees, self._blobs, self._folder.root)
+                    return machine.snapshotted(
+                        await asyncio.to_thread(snapshots.record_tree, snapshot, *more)
+                    )
                 case "send":
                     return machine.sent(await self._send(ticket.request))
                 case "collect":
@@ -219,7 +215,7 @@ class SubmitPipeline:
     async def _collect(self, ticket: Ticket) -> tuple[SubmitDone, bytes]:
         """Writes the feedback; starts over when the disk refuses."""
         assert ticket.accepted is not None
-        tree = SubmitTree(self._workspace / "feedback", ticket.submit_id)
+        tree = SubmitTree(self._folder.feedback, ticket.submit_id)
         known = (ticket, ticket.accepted, self._client, tree, self._journal.at_work, self._changed)
         while True:
             try:

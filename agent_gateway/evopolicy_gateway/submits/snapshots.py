@@ -43,24 +43,23 @@ def take(system: Path, blobs: BlobStore, *, published: bool = False) -> Snapshot
     try:
         bundle = bundles.snapshot(system)
     except BundleError as error:
-        return _failed(system, str(error))
+        return Snapshot(digest=None, error=_no_bundle(system, str(error)))
     except OSError as error:
-        return _failed(system, f"system/ cannot be read: {error.strerror or error}")
-    if all(file.path != POLICY_FILE for file in bundle.files):
-        failed = _failed(system, "system/policy.py is missing; write a class Policy there")
-        return msgspec.structs.replace(failed, kept=blobs.put(bundle.packed))
-    failure = _fault_of_source({file.path: file.data for file in bundle.files}) if published else None
+        why = f"system/ cannot be read: {error.strerror or error}"
+        return Snapshot(digest=None, error=_no_bundle(system, why))
+    files, failure = {file.path: file.data for file in bundle.files}, None
+    if POLICY_FILE not in files:
+        failure = _no_bundle(system, "system/policy.py is missing; write a class Policy there")
+    elif published:
+        failure = _fault_of_source(files)
     digest = blobs.put(bundle.packed)
-    return Snapshot(
-        digest=digest if failure is None else None, error=failure, kept=digest if failure else None
-    )
+    return Snapshot(digest=None if failure else digest, error=failure, kept=digest if failure else None)
 
 
 def record_tree(
     snapshot: Snapshot, submit: str, recorder: Recorder, blobs: BlobStore, folder: Path
 ) -> Snapshot:
-    """The snapshot with the tree of the workspace. When the tree cannot be recorded, it is left out, and the submit
-    continues. `folder`: the run's."""
+    """The snapshot with the workspace's tree, unless that cannot be recorded. `folder`: the run's."""
     digest = snapshot.digest or snapshot.kept
     try:
         bundle = None if digest is None else bundles.load(blobs.read(digest), digest)
@@ -84,9 +83,8 @@ def _fault_of_source(files: dict[str, bytes]) -> PolicyFailure | None:
             return _failure("import_error", f"system/{path} cannot be parsed as Python")
         classes = {node.name for node in tree.body if isinstance(node, ast.ClassDef)}
         if path == POLICY_FILE and "Policy" not in classes:
-            return _failure(
-                "missing_policy", "system/policy.py has no class statement Policy at its top level"
-            )
+            why = "system/policy.py has no class statement Policy at its top level"
+            return _failure("missing_policy", why)
     return None
 
 
@@ -94,9 +92,9 @@ def _failure(category: FailureCategory, message: str) -> PolicyFailure:
     return PolicyFailure(category=category, step_index=None, message=message[:4000])
 
 
-def _failed(system: Path, message: str) -> Snapshot:
+def _no_bundle(system: Path, message: str) -> PolicyFailure:
     try:
         there = stat.S_ISREG((system / POLICY_FILE).lstat().st_mode) and not system.is_symlink()
     except OSError:
         there = False
-    return Snapshot(digest=None, error=_failure("import_error" if there else "missing_policy", message))
+    return _failure("import_error" if there else "missing_policy", message)

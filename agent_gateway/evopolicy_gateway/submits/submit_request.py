@@ -64,7 +64,13 @@ def parse(body: bytes, bounds: Bounds) -> tuple[int, ...]:
     if isinstance(wanted, list):
         if len(wanted) > bounds.max_episodes:
             _refuse_count(len(wanted), bounds)
-        ids = tuple(_listed(item, index, bounds) for index, item in enumerate(wanted))
+        for index, item in enumerate(wanted):
+            where = f"{_FIELD}[{index}]"
+            if type(item) is not int:
+                last = bounds.n_env_instances - 1
+                _instance(f"{where} is {_kind(item)}; every id is an integer from 0 to {last}")
+            _check_id(item, where, bounds)
+        ids = tuple(wanted)
     elif isinstance(wanted, str):
         ids = ids_in(wanted, bounds)
     else:
@@ -85,14 +91,6 @@ def refuse_size(n_bytes: int | None) -> NoReturn:
     _budget(f"the request's body is {size}; at most {MAX_BODY_BYTES:,} bytes are read. Send {_FORM}")
 
 
-def _listed(item: object, index: int, bounds: Bounds) -> int:
-    where = f"{_FIELD}[{index}]"
-    if isinstance(item, bool) or not isinstance(item, int):
-        _instance(f"{where} is {_kind(item)}; every id is an integer from 0 to {bounds.n_env_instances - 1}")
-    _check_id(item, where, bounds)
-    return item
-
-
 def ids_in(text: str, bounds: Bounds) -> tuple[int, ...]:
     """Expands a text of ids and ranges, at most `bounds.max_episodes` ids, none if it is empty. Raises RequestError."""
     if not text.strip():
@@ -105,13 +103,11 @@ def ids_in(text: str, bounds: Bounds) -> tuple[int, ...]:
                 f"{part[:40]!r} in {_FIELD} is neither an id nor a range; write ids and ranges as '0-3,7'"
             )
         first, last = int(match[1]), int(match[2] or match[1])
-        shown = part.strip()[:40]
-        _check_id(first, f"{shown!r} in {_FIELD}", bounds)
-        _check_id(last, f"{shown!r} in {_FIELD}", bounds)
+        where = f"{part.strip()[:40]!r} in {_FIELD}"
+        for number in (first, last):
+            _check_id(number, where, bounds)
         if last < first:
-            _instance(
-                f"{shown!r} in {_FIELD} runs backwards; write it '{last}-{first}', or list the ids in order"
-            )
+            _instance(f"{where} runs backwards; write it '{last}-{first}', or list the ids in order")
         ranges.append(range(first, last + 1))
     if (total := sum(map(len, ranges))) > bounds.max_episodes:
         _refuse_count(total, bounds)

@@ -23,7 +23,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Mapping
 from typing import Literal
 
 import msgspec
@@ -113,8 +113,8 @@ class Ticket(msgspec.Struct, kw_only=True, eq=False):
 class TicketMachine:
     """All submits of one run, of which at most one is in flight."""
 
-    def __init__(self, run: RunOpened, entries: Iterable[tuple[AnyEntry, int]] = ()) -> None:
-        """`entries`: the journal's, oldest first, with their offsets."""
+    def __init__(self, run: RunOpened, entries: Mapping[int, AnyEntry] | None = None) -> None:
+        """`entries`: as in `Journal`."""
         self.run = run
         self.state: RunState = run.state
         """The state known to this gateway; `hear` updates it."""
@@ -135,7 +135,7 @@ class TicketMachine:
         """Number of gateways that died over an episode of a submit, or (None) over the submit as a whole."""
         self._failure: Exception | None = None
         """The unexpected error of the ticket in flight."""
-        for entry, place in entries:
+        for place, entry in (entries or {}).items():
             self.noted(entry, place)
         # `run.state` is newer than the entries, except for an open submit's acceptance.
         if not any(each.accepted and not each.done for each in self.tickets):
@@ -182,11 +182,7 @@ class TicketMachine:
         try:
             ids = self._ids(body)
         except published_requests.OddRequestError as error:
-            if not error.answer.counts:
-                raise
-            status, ids = error.answer.status, error.ids
-            assert status != "bad_request"
-            rejected = open_run.Rejection(status=status, message=error.message, folder=error.answer.folder)
+            ids, rejected = error.ids, error.rejection
         return self._begin(
             Requested(
                 key=key,
@@ -250,9 +246,8 @@ class TicketMachine:
         return "collect"
 
     def snapshotted(self, snapshot: Snapshot) -> Effect:
-        digest, error, kept, tree = snapshot.digest, snapshot.error, snapshot.kept, snapshot.tree
-        request = self._open.request
-        return msgspec.structs.replace(request, bundle=digest, bundle_error=error, kept=kept, tree=tree)
+        more = {"bundle_error": snapshot.error, "kept": snapshot.kept, "tree": snapshot.tree}
+        return msgspec.structs.replace(self._open.request, bundle=snapshot.digest, **more)
 
     def sent(self, reply: messages.SubmitAccepted) -> Effect:
         return open_run.Accepted(key=self._open.request.key, **msgspec.structs.asdict(reply))

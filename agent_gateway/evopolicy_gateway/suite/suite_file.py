@@ -24,9 +24,8 @@ from evopolicy_common.wire import keys
 from evopolicy_gateway.declared import Count, suite_keys
 from evopolicy_gateway.harnesses.interface.agent_config import AgentConfig
 from evopolicy_gateway.jail.settings import JailSettings
-from evopolicy_gateway.run.options import limits_from
 from evopolicy_gateway.run.plan import Plan
-from evopolicy_gateway.run.run_options import RunOptions
+from evopolicy_gateway.run.run_options import RunOptions, limits_from
 
 if TYPE_CHECKING:
 

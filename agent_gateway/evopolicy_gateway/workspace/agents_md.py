@@ -27,13 +27,8 @@ class Urls(msgspec.Struct, frozen=True, kw_only=True):
         return self.info.rpartition("/")[0]
 
     def environment(self) -> dict[str, str]:
-        """The environment variables of an agent's process that hold URLs."""
-        return {
-            "EVOPOLICYGYM_API": self.api,
-            "EVOPOLICYGYM_INFO_URL": self.info,
-            "EVOPOLICYGYM_TASK_URL": self.task,
-            "EVOPOLICYGYM_SUBMIT_URL": self.submit,
-        }
+        urls = {"API": self.api, "INFO_URL": self.info, "TASK_URL": self.task, "SUBMIT_URL": self.submit}
+        return {f"EVOPOLICYGYM_{name}": url for name, url in urls.items()}
 
 
 def base_url(host: str, port: int) -> str:
@@ -284,8 +279,7 @@ PLACEHOLDERS = ("standard", *_TEXT.get_identifiers())
 
 
 def agents_md(run: RunOpened, urls: Urls, text: str = "", *, started: bool = False) -> str:
-    """The text for one run. `text`: the operator's own with `PLACEHOLDERS`; empty: the standard text. `started`: the
-    run starts from a submit of an earlier one."""
+    """The text for one run. `text`: the operator's own, or empty. `started`: from an earlier submit."""
     n_example = max(run.min_episodes_per_submit, min(2, run.max_episodes_per_submit, run.episode_budget))
     example = [index % run.n_env_instances for index in range(n_example)]
     most = min(run.max_episodes_per_submit, run.episode_budget)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pprint
+from collections.abc import Callable
 from typing import Any
 
 from evopolicy_common.messages.environment import SpaceSchema
@@ -73,38 +74,42 @@ def initial_policy(action_space: SpaceSchema) -> str:
 
 
 def constant_action(space: SpaceSchema) -> Any:
-    """One action inside `space`, in plain Python values: zero if it is inside, else the nearest bound.
+    """A plain action inside `space`: zero, else the nearest bound. ValueError for an unknown space."""
+    if space["type"] not in _CONSTANT:
+        raise ValueError(f"no action for a space of type {space['type']!r}")
+    return _CONSTANT[space["type"]](space)
 
-    Raises ValueError for an unknown kind of space.
-    """
-    kind = space["type"]
-    if kind == "Discrete":
-        return int(space.get("start", 0))
-    if kind == "Box":
-        low, high = space.get("low", space.get("min")), space.get("high", space.get("max"))
-        number = float if str(space["dtype"]).startswith("float") else int
-        return _box(list(space["shape"]), low, high, number)
-    if kind == "Image":
-        lowest, highest = space["value_range"]
-        return _box(list(space["shape"]), lowest, highest, int)
-    if kind == "MultiDiscrete":
-        return _like(space["nvec"], space.get("start", 0))
-    if kind == "MultiBinary":
-        n = space["n"]
-        return _box(n if isinstance(n, list) else [n], 0, 1, int)
-    if kind == "Tuple":
-        return tuple(constant_action(part) for part in space["spaces"])
-    if kind == "Dict":
-        return {key: constant_action(part) for key, part in space["spaces"].items()}
-    if kind == "Text":
-        return str(space.get("characters", "a"))[0] * int(space["min_length"])
-    if kind == "Sequence":
-        return []
-    if kind == "OneOf":
-        return (0, constant_action(space["spaces"][0]))
-    if kind == "Graph":
-        return {"nodes": [constant_action(space["node_space"])], "edges": None, "edge_links": None}
-    raise ValueError(f"no action for a space of type {kind!r}")
+
+def _in_box(space: SpaceSchema) -> Any:
+    low, high = space.get("low", space.get("min")), space.get("high", space.get("max"))
+    number = float if str(space["dtype"]).startswith("float") else int
+    return _box(list(space["shape"]), low, high, number)
+
+
+def _image(space: SpaceSchema) -> Any:
+    lowest, highest = space["value_range"]
+    return _box(list(space["shape"]), lowest, highest, int)
+
+
+_CONSTANT: dict[str, Callable[[SpaceSchema], Any]] = {
+    "Discrete": lambda space: int(space.get("start", 0)),
+    "Box": _in_box,
+    "Image": _image,
+    "MultiDiscrete": lambda space: _like(space["nvec"], space.get("start", 0)),
+    "MultiBinary": lambda space: _box(
+        space["n"] if isinstance(space["n"], list) else [space["n"]], 0, 1, int
+    ),
+    "Tuple": lambda space: tuple(map(constant_action, space["spaces"])),
+    "Dict": lambda space: {key: constant_action(part) for key, part in space["spaces"].items()},
+    "Text": lambda space: str(space.get("characters", "a"))[0] * int(space["min_length"]),
+    "Sequence": lambda space: [],
+    "OneOf": lambda space: (0, constant_action(space["spaces"][0])),
+    "Graph": lambda space: {
+        "nodes": [constant_action(space["node_space"])],
+        "edges": None,
+        "edge_links": None,
+    },
+}
 
 
 def _box(shape: list[int], low: Any, high: Any, number: type[int] | type[float]) -> Any:

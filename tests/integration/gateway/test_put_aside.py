@@ -109,7 +109,7 @@ async def test_an_episode_that_kills_two_gateways_is_set_aside(tmp_path: Path) -
         ends = [await child(folder.root) for _ in range(3)]
         assert ends == [-9, -9, 0]
         journal = Journal(folder.journal)
-        died = [entry.episodes for entry in journal.entries if isinstance(entry, Died)]
+        died = [entry.episodes for entry in journal.entries.values() if isinstance(entry, Died)]
         journal.close()
         assert died[0] in ((2,), (3, 2), (2, 3))
         assert died[1:] == [(2,)]
@@ -155,5 +155,5 @@ async def test_a_submit_ending_two_gateways_is_set_aside(
             assert (await s.http.get(f"{s.urls.submit}/submit_000")).status_code == 500
             assert (await s.http.get(f"{s.urls.submit}/submit_001")).status_code == 200
         journal = Journal(folder.journal)
-        assert sum(isinstance(entry, SetAside) for entry in journal.entries) == 1
+        assert sum(isinstance(entry, SetAside) for entry in journal.entries.values()) == 1
         journal.close()

@@ -8,11 +8,13 @@ import subprocess
 import sys
 import time
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from evopolicy_gateway.processes import child_messages
-from evopolicy_gateway.processes.child_messages import AnyEvent, Order, StartAgent
+from evopolicy_gateway.processes.child_messages import Event, Order, StartAgent
+from evopolicy_gateway.run_folder.layout import RunFolder
 
+E = TypeVar("E", bound=Event)
 TIMEOUT_S = 60.0
 AGENT = "import os, time; open(os.path.join({folder!r}, str(os.getpid())), 'w').close(); time.sleep(1000)"
 
@@ -26,7 +28,9 @@ class SupervisorProcess:
         """`more`: fields of `StartAgent`."""
         self.folder = root / "pids"
         self.folder.mkdir(exist_ok=True)
-        self.lock = root / "keeper.lock"
+        self.lock = RunFolder(root).supervisor_lock
+        for folder in (self.lock.parent, RunFolder(root).workspace):
+            folder.mkdir(exist_ok=True)
         self.process = subprocess.Popen(
             [sys.executable, "-m", "evopolicy_gateway.agent_supervisor.supervisor"],
             stdin=subprocess.PIPE,
@@ -35,15 +39,9 @@ class SupervisorProcess:
         )
         program = root / "agent.py"
         program.write_text(AGENT.format(folder=str(self.folder)))
-        usual = {"workspace": str(root), "urls": {}, "wall_limit_s": wall_limit_s, "lock": str(self.lock)}
-        self.tell(
-            StartAgent(
-                agent=agent or f"command:{sys.executable} {program}",
-                agent_log=str(root / "agent.jsonl"),
-                started_in=str(root),
-                **{**usual, **more},  # type: ignore[arg-type]
-            )
-        )
+        usual: dict[str, Any] = {"folder": str(root), "urls": {}, "started_in": str(root)}
+        usual |= {"agent": agent or f"command:{sys.executable} {program}", "wall_limit_s": wall_limit_s}
+        self.tell(StartAgent(**usual, **more))
 
     def tell(self, order: Order) -> None:
         assert self.process.stdin is not None
@@ -58,7 +56,7 @@ class SupervisorProcess:
             time.sleep(0.01)
         return int(found[0])
 
-    def until(self, kind: type[AnyEvent]) -> AnyEvent:
+    def until(self, kind: type[E]) -> E:
         """The next event of a kind."""
         assert self.process.stdout is not None
         for data in self.process.stdout:

@@ -29,10 +29,10 @@ from evopolicy_gateway.harnesses.coding_agents.session import SessionState
 from evopolicy_gateway.harnesses.coding_agents.turn import Capped, play_turn
 from evopolicy_gateway.harnesses.coding_agents.turn_failure import TurnFailure, backoff_s
 from evopolicy_gateway.harnesses.interface.agent_config import relay_variables
-from evopolicy_gateway.harnesses.interface.base import AgentError, Harness, RelayAddress, Stage
+from evopolicy_gateway.harnesses.interface.base import AgentError, Harness, Stage
 from evopolicy_gateway.inputs import own_config
 from evopolicy_gateway.inputs.kept import Kept
-from evopolicy_gateway.processes.child_messages import AgentDoing, AgentEnded
+from evopolicy_gateway.processes.child_messages import AgentDoing, AgentEnded, RelayAddress
 from evopolicy_gateway.relay.limits import ModelTerms
 from evopolicy_gateway.relay.usage import Usage
 

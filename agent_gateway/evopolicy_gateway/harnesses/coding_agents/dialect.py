@@ -14,8 +14,8 @@ from typing import Any
 
 from evopolicy_gateway.harnesses.coding_agents.turn_failure import TurnFailure
 from evopolicy_gateway.harnesses.interface.agent_config import AgentConfig, TokenPaths
-from evopolicy_gateway.harnesses.interface.base import RelayAddress
 from evopolicy_gateway.inputs.kept import Kept
+from evopolicy_gateway.processes.child_messages import RelayAddress
 from evopolicy_gateway.relay.answers import values
 from evopolicy_gateway.relay.usage import Usage, count
 

@@ -24,7 +24,7 @@ from evopolicy_gateway.inputs.kept import Kept
 from evopolicy_gateway.jail.jail import Jail
 from evopolicy_gateway.processes.agent_log import AgentLog
 from evopolicy_gateway.processes.agent_process import AgentProcess
-from evopolicy_gateway.processes.child_messages import AgentDoing, AgentEnded
+from evopolicy_gateway.processes.child_messages import AgentDoing, AgentEnded, RelayAddress
 from evopolicy_gateway.processes.clock import Activity, AgentClock
 from evopolicy_gateway.relay.limits import ModelTerms
 from evopolicy_gateway.workspace.prompts import Prompts
@@ -97,11 +97,6 @@ class Stage(msgspec.Struct, frozen=True, kw_only=True):
         return await asyncio.to_thread(_get_json, self.urls["EVOPOLICYGYM_INFO_URL"])
 
 
-class RelayAddress(msgspec.Struct, frozen=True, kw_only=True):
-    """The relay of the run, as its agent sees it."""
-
-    url: str
-    token: str
 
 
 class Harness(ABC):

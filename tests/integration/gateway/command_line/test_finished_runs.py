@@ -38,10 +38,10 @@ FUNCTIONS = sorted(
 """Every function that the module calls, its own and others': each is a step that may fail."""
 SPARED = (
     "_env_log",
-    "_journal",
+    "_from_journal",
+    "_meta",
     "_own_bundle",
     "_put_in_place",
-    "_write_checkpoint",
     "count_transitions",
 )
 """Steps without which a result is complete."""

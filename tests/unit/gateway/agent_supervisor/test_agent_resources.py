@@ -90,8 +90,6 @@ time.sleep(1000)
 def play(
     folder: Path, program: str, *, wall_limit_s: float = 1000.0, jailed: bool = True, **limits: Any
 ) -> Played:
-    workspace = folder / "workspace"
-    workspace.mkdir()
     path = folder / "program.py"
     path.write_text(program)
     jail = JailOrder(settings=JailSettings(), private=str(folder / "private"))
@@ -99,7 +97,6 @@ def play(
         folder,
         wall_limit_s,
         f"command:{sys.executable} {path}",
-        workspace=str(workspace),
         jail=jail if jailed else None,
         limits=AgentLimits(**limits),
     )
@@ -110,7 +107,7 @@ def play(
     used = [each.resources for each in events if isinstance(each, AgentUsed)][-1]
     notes = "\n".join(each.note for each in events if isinstance(each, AgentDoing))
     assert not [*cgroups.ROOT.glob(f"*/**/evopolicy-agent-{supervisor.process.pid}")]
-    return Played(ended, used, notes, (folder / "agent.jsonl").read_text())
+    return Played(ended, used, notes, (folder / "logs/agent.jsonl").read_text())
 
 
 @needs_cgroups

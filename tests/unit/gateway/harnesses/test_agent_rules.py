@@ -168,15 +168,15 @@ def test_the_clock_stands_still_in_a_pause_and_for_hidden_episodes() -> None:
     now[0] = 4.0
     with clock.paused():
         now[0] = 1000.0
-        assert clock.left_s() == 6.0
+        assert clock.remaining_s() == 6.0
     now[0] = 1005.0
     clock.held(3.0)
-    assert (clock.left_s(), clock.used_s()) == (4.0, 6.0)
+    assert (clock.remaining_s(), clock.used_s()) == (4.0, 6.0)
     clock.held(2.0)
-    assert clock.left_s() == 4.0
+    assert clock.remaining_s() == 4.0
     clock.held(5.0)
     now[0] = 1012.0
-    assert clock.left_s() == -1.0
+    assert clock.remaining_s() == -1.0
 
 
 QWEN = """

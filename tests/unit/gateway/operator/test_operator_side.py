@@ -29,9 +29,15 @@ from evopolicy_gateway.operator.cluster import Cluster
 from evopolicy_gateway.operator.trials import policy_bundle
 from evopolicy_gateway.processes import child_messages
 from evopolicy_gateway.processes.child_messages import AgentDoing, Progress
-from evopolicy_gateway.run.options import cases_of, limits_of, one_environment, packages_for
 from evopolicy_gateway.run.record import run_record
-from evopolicy_gateway.run.run_options import ClusterOptions, RunOptions
+from evopolicy_gateway.run.run_options import (
+    ClusterOptions,
+    RunOptions,
+    cases_of,
+    limits_of,
+    one_environment,
+    packages_for,
+)
 from evopolicy_gateway.run.times import Times
 from evopolicy_gateway.run.watch import RunView
 from evopolicy_gateway.run_folder.layout import Staged

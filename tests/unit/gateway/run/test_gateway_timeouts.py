@@ -151,7 +151,7 @@ class Orders:
 
 supervisor.make = lambda *given: Deaf()
 supervisor.LAST_WORDS_S = 0.2
-order = StartAgent(agent="deaf", workspace=".", agent_log="agent.jsonl", urls={}, started_in=".", wall_limit_s=1000.0)
+order = StartAgent(agent="deaf", folder=".", urls={}, started_in=".", wall_limit_s=1000.0)
 print(asyncio.run(supervisor.keep(order, Orders())).reason)
 """
 

@@ -68,7 +68,7 @@ class World:
     def start(self) -> None:
         """A gateway starts on the journal."""
         run = opened(state=self.state, profile=self.profile, episode_budget=BUDGET)
-        self.machine = TicketMachine(run, zip(self.journal, range(len(self.journal)), strict=True))
+        self.machine = TicketMachine(run, dict(enumerate(self.journal)))
         self.effect: Effect | None = self.machine.next()
         self.ends = False
 
@@ -173,7 +173,7 @@ class World:
         named = Counter(self.sent[key].client_key for key in self.accepted)
         assert all(n == 1 for client_key, n in named.items() if client_key is not None)
         noted = [ticket for ticket in machine.tickets if not ended_without_an_entry(ticket)]
-        again = TicketMachine(machine.run, zip(self.journal, range(len(self.journal)), strict=True))
+        again = TicketMachine(machine.run, dict(enumerate(self.journal)))
         assert [look(ticket) for ticket in noted if ticket.done] == [
             look(ticket) for ticket in again.tickets if ticket.done
         ]
@@ -243,7 +243,7 @@ BUGS = {
     "two submits at once": ("ask", "self.in_flight is not None", "False"),
     "sent before it is journalled": ("next", "not self.in_flight.requested", "False"),
     "sent after it is accepted": ("next", "self.in_flight.accepted is None", "True"),
-    "journalled without its bundle": ("snapshotted", "bundle=digest", "bundle=None"),
+    "journalled without its bundle": ("snapshotted", "bundle=snapshot.digest", "bundle=None"),
     "snapshot again after a crash": ("noted", "requested = entry, True", "requested = entry, False"),
     "nothing charged": ("noted", "budget=remaining", "budget=self.state.remaining_budget"),
     "a refused submit takes an index": ("_end", "self._open.accepted is None", "False"),

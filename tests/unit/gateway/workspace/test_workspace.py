@@ -19,6 +19,7 @@ from evopolicy_common.records.blobs import digest_of
 from evopolicy_gateway.http.info import info_document
 from evopolicy_gateway.http.task import task_markdown
 from evopolicy_gateway.run_folder.layout import RunFolder, run_folder
+from evopolicy_gateway.submits.tickets import TicketMachine
 from evopolicy_gateway.workspace.agents_md import NO_URLS, PLACEHOLDERS, STANDARD, agents_md, urls_below
 from evopolicy_gateway.workspace.prompts import check_text
 from evopolicy_gateway.workspace.staging import constant_action, initial_policy, stage
@@ -184,8 +185,8 @@ def test_the_tasks_schemas_are_json() -> None:
 
 
 def test_info_has_the_protocols_fields_and_no_more_of_the_cluster() -> None:
-    run = opened()
-    document = info_document(run, run.state, False, None)
+    machine = TicketMachine(opened())
+    document = info_document(machine)
     assert {
         *("protocol_version", "state", "env_meta", "episode_budget", "min_episodes_per_submit"),
         *("max_episodes_per_submit", "resource_limits", "allowed_imports", "denied_imports"),
@@ -193,7 +194,8 @@ def test_info_has_the_protocols_fields_and_no_more_of_the_cluster() -> None:
     assert set(document["state"]) == {"remaining_budget", "n_submits", "is_finalized"}
     assert {"rollout_wall_s", "memory_bytes"} <= set(document["resource_limits"])
     assert json.loads(json.dumps(document)) == document
-    assert info_document(run, run.state, True, None)["state"]["is_finalized"] is True
+    machine.close()
+    assert info_document(machine)["state"]["is_finalized"] is True
 
 
 @pytest.mark.parametrize("left", ["first", ".first.lock", ".first.asked"])
