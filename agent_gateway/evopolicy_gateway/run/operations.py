@@ -20,7 +20,6 @@ from evopolicy_common.wire.operator_client import TIMEOUT_S, WAIT_S, OperatorCli
 from evopolicy_common.wire.transport import Link
 from evopolicy_gateway.run_folder.layout import RunFolder, saved
 from evopolicy_gateway.run_folder.locks import until_free
-from evopolicy_gateway.submits.coordinator_client import until_served
 
 log: structlog.stdlib.BoundLogger = structlog.get_logger()
 
@@ -45,8 +44,8 @@ class Operations(OperatorClient):
         known = {"key": wanted.key, "replay_key": wanted.replay_key}
         message = messages.CreateRun(token=self._token, settings=wanted.settings, **known)
         try:
-            kind = messages.RunCreated
-            return await until_served(self._requests, _AWAY, "create", message, kind, timeout_s=TIMEOUT_S)
+            kind, how = messages.RunCreated, {"timeout_s": TIMEOUT_S}
+            return await self._requests.until_answered("create", message, kind, despite=_AWAY, **how)
         except RefusedError as error:
             raise _settings_error(error) from error
 
@@ -84,7 +83,7 @@ class Operations(OperatorClient):
         """Takes, renews, releases (`ttl_s` 0) or settles (`result`) a run of a sweep."""
         known: dict[str, Any] = {"suite": suite, "name": name, "holder": holder, "ttl_s": ttl_s}
         message = messages.Claim(token=self._token, **known, run=run, result=result)
-        return await until_served(self._requests, _AWAY, "claim", message, messages.ClaimState)
+        return await self._requests.until_answered("claim", message, messages.ClaimState, despite=_AWAY)
 
     async def drop(self, folder: RunFolder) -> None:
         """Cancels the open run of a folder, so that it plays no more and its agent's permit ends.

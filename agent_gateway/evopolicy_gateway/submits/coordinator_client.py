@@ -10,7 +10,7 @@ import asyncio
 import contextlib
 import mmap
 import tempfile
-from collections.abc import Callable, Collection
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar, cast
@@ -40,8 +40,6 @@ FIRST_PERMIT_WAIT_S = 3.0
 STATE_TIMEOUT_S = 1.0
 LARGE_BYTES = 16 << 20
 """A larger recording is kept in a file."""
-
-NOT_NOW_PAUSE_S = 0.5
 _AS_REQUESTED = ("key", "env_instances", "bundle", "bundle_error", "tree")
 
 log: structlog.stdlib.BoundLogger = structlog.get_logger()
@@ -143,28 +141,4 @@ class CoordinatorClient:
         await self._ask("close", message, messages.RunClosed)
 
     async def _ask(self, verb: str, message: Message, wanted: type[Wanted], *, wait_s: float = 0.0) -> Wanted:
-        return await until_served(self._requests, NOT_NOW, verb, message, wanted, wait_s=wait_s)
-
-
-async def until_served(
-    requests: Requester[Any],
-    refusals: Collection[str],
-    verb: str,
-    message: Message,
-    wanted: type[Wanted],
-    **timing: Any,
-) -> Wanted:
-    """As `Requester.until_answered`; asks again after one of these refusals, and logs each new reason."""
-    last_message = ""
-    while True:
-        try:
-            return await requests.until_answered(verb, message, wanted, **timing)
-        except RefusedError as error:
-            if error.status not in refusals:
-                raise
-            if error.message != last_message:
-                log.warning(
-                    "the coordinator cannot serve this now; asking again", verb=verb, why=error.message
-                )
-            last_message = error.message
-        await asyncio.sleep(NOT_NOW_PAUSE_S)
+        return await self._requests.until_answered(verb, message, wanted, wait_s=wait_s, despite=NOT_NOW)

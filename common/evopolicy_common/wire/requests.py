@@ -11,7 +11,7 @@ import hashlib
 import io
 import random
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from functools import partial
 from typing import IO, Generic, TypeVar
 
@@ -68,13 +68,22 @@ class Requester(Generic[Reply]):
         *,
         wait_s: float = 0.0,
         timeout_s: float | None = None,
+        despite: Collection[str] = (),
     ) -> Wanted:
-        """As `once`, repeated until a reply comes. Raises TransportError after `timeout_s` seconds (None: never)."""
+        """As `once`, repeated until a reply comes, other than a refusal with a status in `despite`. Raises
+        TransportError after `timeout_s` seconds without any (None: never)."""
         pause, warn_after_s = FIRST_PAUSE_S, WARN_AFTER_S
-        started = time.monotonic()
+        started, refused = time.monotonic(), ""
         while True:
             try:
                 return await self.once(verb, message, wanted, wait_s=wait_s)
+            except RefusedError as error:
+                if error.status not in despite:
+                    raise
+                if error.message != refused:
+                    why = "the coordinator cannot serve this now; asking again"
+                    log.warning(why, verb=verb, why=error.message)
+                started, refused, pause = time.monotonic(), error.message, LONGEST_PAUSE_S
             except TransportError as error:
                 waited = time.monotonic() - started
                 if timeout_s is not None and waited > timeout_s:
