@@ -7,7 +7,7 @@ import atexit
 import contextlib
 import importlib.util
 import os
-from collections.abc import AsyncIterator, Awaitable, Callable, Iterable, Mapping
+from collections.abc import AsyncIterator, Callable, Coroutine, Iterable, Mapping
 from pathlib import Path
 from typing import Any, Self, TypeVar, Unpack
 
@@ -202,24 +202,20 @@ class Cluster:
         if self._held is not None:
             await asyncio.wait([self._held])
 
-    async def _on(self, env: str, tier: Tier, work: Callable[[operator.Reached], Awaitable[T]]) -> T:
+    async def _on(
+        self, env: str, tier: Tier, work: Callable[[operator.Reached], Coroutine[Any, Any, T]]
+    ) -> T:
         """Returns the result of `work`; raises the local cluster's error when the cluster fails first."""
         reached = self._reached
         if reached is None:
             raise ConfigError("this cluster is not open: use it inside `with Cluster.local() as cluster:`")
-        results: list[T] = []
-
-        async def kept() -> None:
-            results.append(await work(reached))
-
         if reached.local is not None and self._where.local is not None:
             async with self._offering:
                 if env not in self._offered:
                     await reached.local.start_workers([env], slots=self._where.local.slots, tiers={tier})
                     self._offered.add(env)
         failed = None if reached.local is None else reached.local.failed
-        await unless_failed(asyncio.create_task(kept()), failed)
-        return results[0]
+        return await unless_failed(asyncio.create_task(work(reached)), failed)
 
     async def _evaluated(self, trial: Trial, progress: bool) -> Evaluation:
         bundle, message = trial

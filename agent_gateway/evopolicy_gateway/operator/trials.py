@@ -98,23 +98,23 @@ async def try_policy(
     bundle = policy_bundle(policy)
     check_writable(out, "--out")
     console = terminal(stderr=as_json)
-    results: list[TrialResult] = []
     notes: set[str] = set()
     message = evaluation(env, bundle.digest, "train", cases, **more)
 
-    async def work(operations: Operations) -> None:
+    async def work(operations: Operations) -> TrialResult:
         await operations.upload(bundle.digest, bundle.packed)
-        results.append(await _result(message, where, operations, console, out))
+        result = await _result(message, where, operations, console, out)
         if not catalogue.is_shipped(env):
             offered = (each.description for each in (await operations.environments())[0])
             notes.update(each.notes() for each in offered if each.env == env)
+        return result
 
     async with connected(where, [env], {message.sandbox_tier}) as (operations, _, failed):
-        await unless_failed(asyncio.create_task(work(operations)), failed)
-    _print(results, as_json, console)
+        result = await unless_failed(asyncio.create_task(work(operations)), failed)
+    _print([result], as_json, console)
     for note in filter(None, notes):
         say(f"note: {note}", err=True)
-    return int(any(episode.failure for episode in results[0].episodes))
+    return int(any(episode.failure for episode in result.episodes))
 
 
 async def play_random(
@@ -122,17 +122,16 @@ async def play_random(
 ) -> int:
     """Plays uniform random actions and prints the returns."""
     console = terminal(stderr=as_json)
-    results: list[TrialResult] = []
     # Without a policy no sandbox is needed, but a worker of another cluster may not offer the tier `none`.
     tier: Tier = "bwrap" if where.local is None else "none"
 
-    async def work(operations: Operations) -> None:
-        for env_id in env_ids:
-            message = evaluation(env_id, None, split, cases, record="actions", sandbox_tier=tier)
-            results.append(await _result(message, where, operations, console))
+    async def work(operations: Operations) -> list[TrialResult]:
+        more: dict[str, Any] = {"record": "actions", "sandbox_tier": tier}
+        messages = [evaluation(env_id, None, split, cases, **more) for env_id in env_ids]
+        return [await _result(message, where, operations, console) for message in messages]
 
     async with connected(where, env_ids, {"none"}) as (operations, _, failed):
-        await unless_failed(asyncio.create_task(work(operations)), failed)
+        results = await unless_failed(asyncio.create_task(work(operations)), failed)
     _print(results, as_json, console)
     return 0
 

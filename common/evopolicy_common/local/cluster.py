@@ -15,7 +15,7 @@ import time
 from collections.abc import AsyncIterator, Awaitable, Callable, Collection, Iterable, Sequence
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 from evopolicy_common import catalogue
 from evopolicy_common.catalogue import installs
@@ -32,6 +32,7 @@ from evopolicy_common.wire import credentials, transport
 from evopolicy_common.wire.credentials import Ready, read_ready
 from evopolicy_common.wire.operator_client import OperatorClient
 
+T = TypeVar("T")
 START_TIMEOUT_S = 60.0
 END_GRACE_S = 10.0
 _RESTART_PAUSE_S = 0.5
@@ -218,13 +219,14 @@ def _locked(new: Path) -> int:
     return fd
 
 
-async def unless_failed(work: asyncio.Task[None], failed: asyncio.Future[None] | None) -> None:
-    """Waits for `work`; raises the local cluster's error if that is first. `failed` None: the cluster is not ours."""
+async def unless_failed(work: asyncio.Task[T], failed: asyncio.Future[None] | None) -> T:
+    """The result of `work`, or the local cluster's error if that is first. `failed` None: it is not ours."""
     try:
-        await asyncio.wait([work, *([failed] if failed else [])], return_when=asyncio.FIRST_COMPLETED)
+        both: list[asyncio.Future[Any]] = [work, *([failed] if failed else [])]
+        await asyncio.wait(both, return_when=asyncio.FIRST_COMPLETED)
         if failed is not None and failed.done() and not work.done():
             failed.result()
-        await work
+        return await work
     finally:
         if not work.done():
             if not work.cancelling():
