@@ -189,7 +189,7 @@ async def test_a_body_of_100_megabytes_is_refused_and_the_refusal_is_heard(tmp_p
         assert (await s.submit([0])).status_code == 200
 
 
-async def test_what_does_not_know_the_token_learns_nothing(tmp_path: Path) -> None:
+async def test_a_client_without_the_token_learns_nothing(tmp_path: Path) -> None:
     async with served(tmp_path) as s:
         parts = urlsplit(s.urls.info)
         root = f"{parts.scheme}://{parts.netloc}"

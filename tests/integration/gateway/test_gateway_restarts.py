@@ -30,11 +30,13 @@ TIMES = ("submit_started_at", "submit_completed_at", "wall_time_seconds")
 
 def tree_of(folder: Path) -> dict[str, bytes]:
     """Files by path; times of summaries are taken out."""
-    found = {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+    contents = {
+        str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()
+    }
     times = b'"(' + "|".join(TIMES).encode() + b')": [^,\n]+'
     return {
         name: re.sub(times, b"", data) if name.endswith("summary.json") else data
-        for name, data in found.items()
+        for name, data in contents.items()
     }
 
 
@@ -240,8 +242,8 @@ async def test_a_gateway_keeps_nothing_of_the_episodes_that_it_has_answered(tmp_
             for _ in range(submits):
                 assert (await s.submit(cases)).status_code == 200
             gc.collect()
-            found = tracemalloc.take_snapshot().statistics("filename")
-            return sum(each.size for each in found if "evopolicy_gateway" in each.traceback[0].filename)
+            allocations = tracemalloc.take_snapshot().statistics("filename")
+            return sum(each.size for each in allocations if "evopolicy_gateway" in each.traceback[0].filename)
 
         tracemalloc.start()
         try:

@@ -38,9 +38,9 @@ class Policy:
         pass
 
     def act(self, obs):
-        found = scipy.optimize.minimize_scalar(lambda x: (x - 0.25) ** 2)
-        assert abs(found.x - 0.25) < 1e-6
-        return [float(found.x) / 4]
+        minimum = scipy.optimize.minimize_scalar(lambda x: (x - 0.25) ** 2)
+        assert abs(minimum.x - 0.25) < 1e-6
+        return [float(minimum.x) / 4]
 """
 
 
@@ -113,7 +113,7 @@ def test_published_policies_import_what_the_checker_allows_them_by_name(root: Pa
 
 def test_the_python_package_takes_them_too(root: Path) -> None:
     with evp.Cluster.local(slots=1, fresh=True, policy_packages=("scipy",)) as cluster:
-        found = cluster.evaluate(root, env="toy/line", cases=[0], progress=False)
-    assert found[0].failure is None
+        results = cluster.evaluate(root, env="toy/line", cases=[0], progress=False)
+    assert results[0].failure is None
     with pytest.raises(evp.ConfigError, match="give a sequence of names"):
         evp.Cluster.local(policy_packages="scipy")

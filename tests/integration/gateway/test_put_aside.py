@@ -1,4 +1,4 @@
-"""What a gateway ends over is put aside with an error, and the run goes on."""
+"""An episode or submit over which gateways die is put aside with an error, and the run goes on."""
 
 from __future__ import annotations
 

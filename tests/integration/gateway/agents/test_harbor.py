@@ -60,8 +60,8 @@ def play(folder: Path, tasks: Path, agent: str) -> dict[str, Any]:
         check=False,
     )
     assert done.returncode == 0, done.stdout + done.stderr
-    (path,) = (folder / "jobs").glob("*/*/result.json")
-    result: dict[str, Any] = json.loads(path.read_text())
+    (file,) = (folder / "jobs").glob("*/*/result.json")
+    result: dict[str, Any] = json.loads(file.read_text())
     return result
 
 

@@ -61,7 +61,7 @@ def the_key_is_set(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def used_in(record: RunRecord) -> tuple[ModelUse, Tokens]:
-    """A run's use of its model."""
+    """The run's use of its model."""
     assert record.agent.model_use is not None
     assert record.agent.tokens is not None
     return record.agent.model_use, record.agent.tokens

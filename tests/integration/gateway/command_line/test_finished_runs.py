@@ -63,8 +63,8 @@ def plan_of(root: Path, **more: Any) -> Plan:
 def played(plan: Plan, operator_file: Path) -> tuple[str, str]:
     """State of the run in its command, and the command's output."""
     output = io.StringIO()
-    found = asyncio.run(runs.play([plan], Cluster(file=operator_file), 1, Terminal(file=output, width=300)))
-    return found.index.runs[plan.name].state, output.getvalue()
+    done = asyncio.run(runs.play([plan], Cluster(file=operator_file), 1, Terminal(file=output, width=300)))
+    return done.index.runs[plan.name].state, output.getvalue()
 
 
 @pytest.fixture(scope="module")

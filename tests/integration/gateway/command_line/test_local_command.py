@@ -38,8 +38,8 @@ def test_local_plays_a_whole_run_and_leaves_nothing_behind(tmp_path: Path) -> No
     assert record.outcome.random_reference is not None
     assert record.agent.harness == record.agent.entry == "evolve"
     assert record.versions.fingerprint["numpy"]
-    left = {path.name for path in folder.iterdir()}
-    assert left == {PASSED, "checkpoints", "logs", "run.json", "trees", "workspace"}
+    entries = {path.name for path in folder.iterdir()}
+    assert entries == {PASSED, "checkpoints", "logs", "run.json", "trees", "workspace"}
     # Digests of what the agent got by the tests' `--jail-env`, and of nothing else.
     passed = read_passed(folder)
     assert passed is not None
@@ -98,7 +98,7 @@ def test_a_killed_local_command_takes_everything_with_it(tmp_path: Path) -> None
         states = [state for pid in below if (state := state_folder(pid)) is not None]
         running.process.kill()
         wait_until(lambda: not running.alive())
-    # What SIGKILL gave it no chance to clear away goes at the next start.
+    # Files that a killed command could not clear away go at the next start.
     assert Path(states[0]).is_dir()
     scratch.clear_stale("local")
     assert not Path(states[0]).exists()

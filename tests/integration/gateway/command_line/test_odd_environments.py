@@ -27,7 +27,7 @@ SOURCE = r'File "\S+odd_envs.py", line \d+, in '
 
 
 class Row(NamedTuple):
-    """What is tried, and what is said."""
+    """A command and its output."""
 
     says: str
     """Regular expression for what the command prints."""

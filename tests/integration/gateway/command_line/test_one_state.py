@@ -64,7 +64,7 @@ submit([1])
 """
 
 
-def test_what_a_user_plays_shares_cases_until_a_run_without_a_jail(tmp_path: Path) -> None:
+def test_a_users_runs_share_cases_until_one_without_a_jail(tmp_path: Path) -> None:
     state = tmp_path / "xdg" / "evopolicy" / "local"
     before, note = played(tmp_path, "a")
     assert "note: " not in note
@@ -107,7 +107,7 @@ def test_what_a_user_plays_shares_cases_until_a_run_without_a_jail(tmp_path: Pat
 
 
 def known_hash(secret: bytes, split: Split, hashes: dict[str, str]) -> str:
-    """What who has the secret takes the cases of `toy/line` in SMALL runs for."""
+    """The cases of `toy/line` in SMALL runs, as derived from the secret."""
     counts: dict[Split, int] = {"train": 16, "validation": 2, "heldout": 2}
     return f"sha256:{cases_hash(derive(secret, 'toy', 'toy/line', counts)[split])}"
 
@@ -127,7 +127,7 @@ def test_a_second_command_beside_the_first_is_told_what_to_do(tmp_path: Path) ->
         assert "the next call has others under the same ids" in out
         assert "played by" not in out
         running.kill()
-    # What was killed keeps nobody from the state, and no later run waits for its agent or its workers.
+    # The killed run keeps nobody from the state, and no later run waits for its agent or its workers.
     assert len(kernels(state)) == 1
     played(tmp_path, "after")
     assert len(kernels(state)) == 1

@@ -110,8 +110,8 @@ def test_bad_input_gets_its_verdict_and_a_message_that_helps(ran: Plays) -> None
     played = ran(BAD_INPUT, "--budget", "20", "--limit", "act_wall_s=1")
     folder = played.folder
     log = {
-        name: (status, left, message)
-        for name, status, left, message in json.loads((folder / "workspace" / "log.json").read_text())
+        name: (status, remaining, message)
+        for name, status, remaining, message in json.loads((folder / "workspace" / "log.json").read_text())
     }
     expected = {
         "ids out of range": ("invalid_env_instance", 20, "0 to 63"),
@@ -129,16 +129,20 @@ def test_bad_input_gets_its_verdict_and_a_message_that_helps(ran: Plays) -> None
         "never returns": ("ok", 10, None),
         "act raises": ("ok", 9, None),
     }
-    for name, (status, left, text) in expected.items():
-        assert log[name][:2] == (status, left), (name, log[name])
+    for name, (status, remaining, text) in expected.items():
+        assert log[name][:2] == (status, remaining), (name, log[name])
         if text is not None:
             assert text in log[name][2], (name, log[name])
     feedback = folder / "workspace" / "feedback"
-    found = {}
+    categories = {}
     for index, name in ((8, "nonsense action"), (9, "never returns"), (10, "act raises")):
         errors = (feedback / f"submit_{index:03d}").glob("episodes/*/error.txt")
-        found[name] = [json.loads(error.read_text())["category"] for error in errors]
-    assert found == {"nonsense action": [], "never returns": ["act_timeout"], "act raises": ["act_error"]}
+        categories[name] = [json.loads(error.read_text())["category"] for error in errors]
+    assert categories == {
+        "nonsense action": [],
+        "never returns": ["act_timeout"],
+        "act raises": ["act_error"],
+    }
     rows = (feedback / "submit_008/episodes").glob("*/trajectory.jsonl")
     assert all(
         json.loads(line)["info"]["action_invalid"] for path in rows for line in path.read_text().splitlines()

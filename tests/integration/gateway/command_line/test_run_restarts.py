@@ -80,14 +80,14 @@ time.sleep(1000)
 """
     arguments = run_arguments(operator_file, agent(tmp_path, code))
     with command(tmp_path, *arguments, "--jail", "none") as running:
-        found = wait_until(lambda: [*(tmp_path / "runs").glob("*/*/t/workspace/child.pid")])[0]
-        wait_until(found.read_text)
+        pid_file = wait_until(lambda: [*(tmp_path / "runs").glob("*/*/t/workspace/child.pid")])[0]
+        wait_until(pid_file.read_text)
         os.kill(running.running("evopolicy_gateway.agent_supervisor.supervisor"), signal.SIGKILL)
         exit_code, out, err = running.finish()
         assert exit_code == 0, err
         assert running.alive() == []
     assert "supervisor died; starting it again" in " ".join(out.split())
-    assert (found.parent / "gone").read_text() == "True"
+    assert (pid_file.parent / "gone").read_text() == "True"
     outcome = record_in(run_dir(tmp_path)).outcome
     assert (outcome.closed_reason, outcome.budget_used) == ("agent_stopped", 2)
 

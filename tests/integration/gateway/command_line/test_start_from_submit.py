@@ -25,7 +25,7 @@ for gain in range(3):
 CHILD = """
 import pathlib
 
-found = {
+files = {
     str(path): path.read_text(errors="replace") for path in pathlib.Path(".").rglob("*") if path.is_file()
 }
 tried = []
@@ -35,7 +35,7 @@ for path in ("history/submit_000/summary.json", "history/new"):
         tried.append(path)
     except OSError:
         pass
-json.dump({"found": found, "written": tried}, open("seen.json", "w"))
+json.dump({"found": files, "written": tried}, open("seen.json", "w"))
 submit([0, 1, 2, 3, 4, 5])
 """
 
@@ -74,25 +74,25 @@ def child(parent: Path, operator_file: Path, tmp_path_factory: pytest.TempPathFa
 
 
 def seen(child: Path) -> dict[str, Any]:
-    found: dict[str, Any] = json.loads((child / "workspace" / "seen.json").read_text())
-    return found
+    files: dict[str, Any] = json.loads((child / "workspace" / "seen.json").read_text())
+    return files
 
 
 def test_each_submit_of_a_run_has_a_tree_that_its_record_names(parent: Path) -> None:
-    found = {name: trees.read(parent, f"submit_00{name}") for name in record_in(parent).trees}
-    assert sorted(found) == ["0", "1", "2"]
-    assert record_in(parent).trees == {name: digest for name, (_, digest) in found.items()}
-    assert [file.path for file in found["2"][0].files] == ["notes.md", "system/policy.py"]
-    assert list(found["2"][0].omitted) == ["link"]
+    files = {name: trees.read(parent, f"submit_00{name}") for name in record_in(parent).trees}
+    assert sorted(files) == ["0", "1", "2"]
+    assert record_in(parent).trees == {name: digest for name, (_, digest) in files.items()}
+    assert [file.path for file in files["2"][0].files] == ["notes.md", "system/policy.py"]
+    assert list(files["2"][0].omitted) == ["link"]
 
 
 def test_a_start_has_the_workspace_of_that_submit(child: Path) -> None:
-    found = seen(child)["found"]
-    assert found["notes.md"] == "note 0\nnote 1\n"
-    assert "# edit 1" in found["system/policy.py"]
-    assert "# edit 2" not in found["system/policy.py"]
-    assert "`history/`" in found["AGENTS.md"]
-    assert not [path for path in found if path.startswith("feedback/")]
+    files = seen(child)["found"]
+    assert files["notes.md"] == "note 0\nnote 1\n"
+    assert "# edit 1" in files["system/policy.py"]
+    assert "# edit 2" not in files["system/policy.py"]
+    assert "`history/`" in files["AGENTS.md"]
+    assert not [path for path in files if path.startswith("feedback/")]
 
 
 def test_the_history_is_no_part_of_the_tree(child: Path) -> None:
@@ -102,11 +102,11 @@ def test_the_history_is_no_part_of_the_tree(child: Path) -> None:
 
 
 def test_the_history_is_the_feedback_up_to_that_submit_read_only(parent: Path, child: Path) -> None:
-    found = seen(child)["found"]
+    files = seen(child)["found"]
     for name in ("submit_000", "submit_001"):
         path = Path(name) / "summary.json"
-        assert found[f"history/{path}"] == (parent / "workspace" / "feedback" / path).read_text()
-    assert not [path for path in found if path.startswith("history/submit_002")]
+        assert files[f"history/{path}"] == (parent / "workspace" / "feedback" / path).read_text()
+    assert not [path for path in files if path.startswith("history/submit_002")]
     assert seen(child)["written"] == []
 
 

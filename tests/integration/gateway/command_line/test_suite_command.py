@@ -75,7 +75,7 @@ def sweep(cwd: Path, *arguments: str) -> AbstractContextManager[Command]:
 
 
 def swept(cwd: Path, *arguments: str, ends: int = 0) -> str:
-    """What that command says until it ends."""
+    """The output of that command until it ends."""
     return "".join(ended(cwd, "suite", "t.toml", *arguments, ends=ends))
 
 
@@ -258,7 +258,7 @@ def test_a_run_with_a_wrong_key_is_played_again(tmp_path: Path, operator_file: P
     (entry,) = index_in(root).values()
     assert entry["state"] == "error"
     assert "before its first submit" in entry["error"]
-    # What the fake plays is told by its settings, which make another run of it.
+    # The settings of the fake say what it plays, so other ones make another run of it.
     write_suite(tmp_path, claude="work")
     swept(tmp_path, *arguments, "--changed", "rerun")
     (entry,) = index_in(root).values()

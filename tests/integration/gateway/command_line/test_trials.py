@@ -68,12 +68,12 @@ def test_the_same_ids_are_the_same_cases_in_the_next_call(operator_file: Path, t
         "  def act(self, obs): return [obs[2] - obs[0]]\n"
     )
     where = ["--env", "toy/line", "--credentials", str(operator_file), "--json"]
-    found = []
+    returns = []
     for cases in ("0-3", "2,3,0,1"):
         out, _ = ended(tmp_path, "try", ".", *where, "--cases", cases)
-        found.append({one["case"]: one["episode_return"] for one in json.loads(out)[0]["episodes"]})
-    assert found[0] == found[1]
-    assert len(set(found[0].values())) == 4
+        returns.append({one["case"]: one["episode_return"] for one in json.loads(out)[0]["episodes"]})
+    assert returns[0] == returns[1]
+    assert len(set(returns[0].values())) == 4
 
 
 def test_random_plays_the_reference_on_a_split(operator_file: Path, tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""What cannot start is refused at once with the remedy; what waits for more than three seconds says for what."""
+"""Commands that cannot start are refused at once with the remedy; longer waits have their reason printed."""
 
 from __future__ import annotations
 

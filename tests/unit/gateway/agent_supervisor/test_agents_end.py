@@ -29,10 +29,10 @@ from evopolicy_gateway.run_folder.listener import Listener
 
 @pytest.fixture
 def supervisor(tmp_path: Path) -> Iterator[SupervisorProcess]:
-    found = SupervisorProcess(tmp_path)
-    yield found
-    found.process.kill()
-    found.process.communicate()
+    started = SupervisorProcess(tmp_path)
+    yield started
+    started.process.kill()
+    started.process.communicate()
 
 
 def test_a_surviving_agent_is_reported_until_it_is_gone(supervisor: SupervisorProcess) -> None:

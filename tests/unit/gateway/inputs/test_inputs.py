@@ -34,17 +34,17 @@ def kept(folder: Path, place: Path) -> Kept:
 
 
 def test_a_digest_depends_on_content_and_not_on_the_place(tmp_path: Path) -> None:
-    found = []
+    contents = []
     for name in ("one", "two"):
         (tmp_path / name).mkdir()
         skills, servers = declare(tmp_path / name)
-        found.append([each.recorded for each in read(skills, servers, tmp_path / name)])
-    assert found[0] == found[1]
-    assert [(each.kind, each.name, each.hosts) for each in found[0]] == [
+        contents.append([each.recorded for each in read(skills, servers, tmp_path / name)])
+    assert contents[0] == contents[1]
+    assert [(each.kind, each.name, each.hosts) for each in contents[0]] == [
         ("skill", "lamps", ()),
         ("mcp", "lamp", ("lamps.example.org",)),
     ]
-    assert inputs_digest(found[0]) == inputs_digest(found[0][::-1]) != inputs_digest(found[0][:1])
+    assert inputs_digest(contents[0]) == inputs_digest(contents[0][::-1]) != inputs_digest(contents[0][:1])
 
 
 @pytest.mark.parametrize(
@@ -128,8 +128,8 @@ def test_odd_servers_are_refused_with_the_entry(tmp_path: Path) -> None:
 
 
 def test_a_runs_own_copies_outlive_their_source(tmp_path: Path) -> None:
-    found = kept(tmp_path, tmp_path / "run")
-    shown = dict(found.shown("~/.agents/skills"))
+    copies = kept(tmp_path, tmp_path / "run")
+    shown = dict(copies.shown("~/.agents/skills"))
     assert sorted(shown.values()) == ["/inputs/mcp.json", "/inputs/mcp/lamp", "~/.agents/skills/lamps"]
     script = tmp_path / "run" / "skills" / "lamps" / "scripts" / "read.sh"
     assert (script.stat().st_mode & 0o777) == 0o555
@@ -138,7 +138,7 @@ def test_a_runs_own_copies_outlive_their_source(tmp_path: Path) -> None:
     assert server["env"] == {"UNIT": "lux"}
 
 
-def test_what_changes_while_a_run_is_open_is_refused_by_name(tmp_path: Path) -> None:
+def test_inputs_that_change_while_a_run_is_open_are_refused_by_name(tmp_path: Path) -> None:
     place = tmp_path / "run"
     skills, servers = declare(tmp_path)
     expected = [each.recorded for each in read(skills, servers, tmp_path)]
@@ -161,9 +161,9 @@ def test_what_changes_while_a_run_is_open_is_refused_by_name(tmp_path: Path) -> 
 def test_the_digest_is_a_setting_of_the_run(tmp_path: Path) -> None:
     skills, servers = declare(tmp_path)
     config = AgentConfig(harness="codex", skills=skills, mcp=servers)
-    found = texts.read(None, None, config, tmp_path)
-    assert found.digests["inputs"] == inputs_digest(found.inputs)
-    assert len(found.digests["inputs"]) == 64
+    given = texts.read(None, None, config, tmp_path)
+    assert given.digests["inputs"] == inputs_digest(given.inputs)
+    assert len(given.digests["inputs"]) == 64
     assert texts.read(None, None, AgentConfig(harness="codex"), tmp_path).digests["inputs"] == ""
 
 

@@ -17,16 +17,16 @@ from evopolicy_gateway.processes.agent_log import AgentLog
 
 @pytest.fixture
 def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    found = tmp_path / "operator"
-    (found / ".codex" / "sessions").mkdir(parents=True)
-    (found / ".codex" / "prompts").mkdir()
-    (found / ".codex" / "config.toml").write_text("model = 'mine'")
-    (found / ".codex" / "auth.json").write_text("{}")
-    (found / ".codex" / "auth.json").chmod(0o600)
-    (found / ".codex" / "prompts" / "brief.md").write_text("Be brief.")
-    (found / ".codex" / "sessions" / "another-run.jsonl").touch()
-    monkeypatch.setenv("HOME", str(found))
-    return found
+    own_home = tmp_path / "operator"
+    (own_home / ".codex" / "sessions").mkdir(parents=True)
+    (own_home / ".codex" / "prompts").mkdir()
+    (own_home / ".codex" / "config.toml").write_text("model = 'mine'")
+    (own_home / ".codex" / "auth.json").write_text("{}")
+    (own_home / ".codex" / "auth.json").chmod(0o600)
+    (own_home / ".codex" / "prompts" / "brief.md").write_text("Be brief.")
+    (own_home / ".codex" / "sessions" / "another-run.jsonl").touch()
+    monkeypatch.setenv("HOME", str(own_home))
+    return own_home
 
 
 def test_settings_and_login_are_copied_and_sessions_are_not(home: Path, tmp_path: Path) -> None:
@@ -72,7 +72,7 @@ def test_a_copy_that_was_interrupted_begins_anew(home: Path, tmp_path: Path) -> 
     assert (tmp_path / "run" / "home").stat().st_mode & 0o777 == 0o700
 
 
-def test_what_a_settings_file_tells_of_other_folders_is_left_out(home: Path, tmp_path: Path) -> None:
+def test_fields_about_other_folders_are_left_out_of_a_settings_file(home: Path, tmp_path: Path) -> None:
     known = {"oauthAccount": {"id": "me"}, "projects": {"/secret/place": {"history": ["my prompt"]}}}
     (home / ".claude.json").write_text(json.dumps(known))
     (home / ".claude.json").chmod(0o600)
@@ -98,10 +98,10 @@ def test_no_key_of_a_copied_login_stays_in_the_agents_log(home: Path, tmp_path: 
         (home / name).write_text(text)
     (home / ".qwen").mkdir()
     (home / ".qwen" / "oauth_creds.json").write_bytes(b"\xff" + b"[" * 100_000)
-    found = [text for name in PLACES for text in secrets(places(True, name))]
+    texts = [text for name in PLACES for text in secrets(places(True, name))]
     expected = {f"{kind}0123456789abcdef" for kind in ("rt_", "toml-", "env-", "oc-")}
-    assert set(found) == expected
-    log = AgentLog(tmp_path / "agent.jsonl", Redaction(["an-api-key-of-the-environment"]).knowing(found))
+    assert set(texts) == expected
+    log = AgentLog(tmp_path / "agent.jsonl", Redaction(["an-api-key-of-the-environment"]).knowing(texts))
     log.raw(" ".join([*expected, "an-api-key-of-the-environment"]).encode(), "stdout")
     log.close()
     logged = json.loads((tmp_path / "agent.jsonl").read_text())["text"]

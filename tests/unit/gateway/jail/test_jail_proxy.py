@@ -50,7 +50,7 @@ async def ask(
         (f"CONNECT example.org:{'4' * 5000} HTTP/1.1", b"403"),
     ],
 )
-def test_what_is_not_a_named_host_and_port_is_refused(request_line: str, status: bytes) -> None:
+def test_anything_but_a_named_host_and_port_is_refused(request_line: str, status: bytes) -> None:
     hosts = frozenset({("example.org", 443)})
     answer = asyncio.run(ask(request_line.encode() + b"\r\n\r\n", hosts))
     assert answer.split()[1] == status
@@ -59,10 +59,10 @@ def test_what_is_not_a_named_host_and_port_is_refused(request_line: str, status:
 def test_a_forbidden_host_is_logged_once(monkeypatch: pytest.MonkeyPatch) -> None:
     logged: list[str] = []
     monkeypatch.setattr(proxy.log, "warning", lambda text, host: logged.append(host))
-    found = JailProxy({}, frozenset())
+    jail_proxy = JailProxy({}, frozenset())
     for k in range(300):
-        found._log_denied("example.org:443")
-        found._log_denied(f"{k}.example.org:443")
+        jail_proxy._log_denied("example.org:443")
+        jail_proxy._log_denied(f"{k}.example.org:443")
     assert logged[:2] == ["example.org:443", "0.example.org:443"]
     assert len(logged) == len(set(logged)) == proxy.MAX_DENIED_LOGGED
 

@@ -1,4 +1,4 @@
-"""What an operator may choose of a jail, and what is refused before anything is started."""
+"""The settings of a jail, and the ones that are refused before anything is started."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def test_a_host_is_a_name_and_a_port(name: str, port: int | None) -> None:
 @pytest.mark.parametrize(
     "text", ["", "*", "*.example.org", "a:0", "a:70000", "https://a", "a/b", "a:b", "a b", ".a"]
 )
-def test_what_is_no_host_is_refused(text: str) -> None:
+def test_anything_but_a_host_is_refused(text: str) -> None:
     with pytest.raises(ConfigError, match="--allow-host"):
         host(text)
 
@@ -83,7 +83,7 @@ def test_ctrl_c_does_not_reach_a_tried_bubblewrap(tmp_path: Path, monkeypatch: p
     check_bubblewrap()
 
 
-def test_what_is_recorded_tells_the_modes_apart() -> None:
+def test_the_record_tells_the_modes_apart() -> None:
     modes = [JailSettings(mode=mode).recorded for mode in ("bwrap", "open-network", "none")]
     assert modes == ["bwrap", "bwrap, open network", "none"]
     assert JailSettings().chosen() == {}

@@ -34,11 +34,11 @@ def test_no_call_gives_a_file_a_set_id_bit(machine: str, monkeypatch: pytest.Mon
         return allowed(program, numbers[call], *arguments, machine=machine)
 
     def calls(mode: int) -> dict[str, tuple[int, ...]]:
-        found = {"chmod": (PATH, mode), "fchmod": (FILE, mode), "fchmodat": (HERE, PATH, mode)}
-        found |= {"creat": (PATH, mode), "fchmodat2": (HERE, PATH, mode, 0)}
-        found |= {"mknod": (PATH, mode, 0), "mknodat": (HERE, PATH, mode, 0)}
-        found |= {"open": (PATH, MAKE, mode), "openat": (HERE, PATH, MAKE, mode)}
-        return {name: arguments for name, arguments in found.items() if name in numbers}
+        by_call = {"chmod": (PATH, mode), "fchmod": (FILE, mode), "fchmodat": (HERE, PATH, mode)}
+        by_call |= {"creat": (PATH, mode), "fchmodat2": (HERE, PATH, mode, 0)}
+        by_call |= {"mknod": (PATH, mode, 0), "mknodat": (HERE, PATH, mode, 0)}
+        by_call |= {"open": (PATH, MAKE, mode), "openat": (HERE, PATH, MAKE, mode)}
+        return {name: arguments for name, arguments in by_call.items() if name in numbers}
 
     for mode in (0o4755, 0o2755, 0o6000, 0o107755):
         assert {verdict(name, *arguments) for name, arguments in calls(mode).items()} == {EPERM}

@@ -64,8 +64,8 @@ def test_a_lone_program_brings_itself_and_the_files_its_command_names(tmp_path: 
     data.touch()
     (tmp_path / "tools" / "secret").touch()
     needs = needs_of([str(tool), "--data", str(data), "/no/such/file", "word"], None)
-    found = {path for path in needs.paths if path.startswith(str(tmp_path))}
-    assert found == {str(tool), str(data)}
+    paths = {path for path in needs.paths if path.startswith(str(tmp_path))}
+    assert paths == {str(tool), str(data)}
 
 
 def test_our_environments_packages_are_not_shown_as_a_whole() -> None:
@@ -82,11 +82,11 @@ def test_simulators_are_found_wherever_a_python_keeps_its_packages(tmp_path: Pat
     for name in ("gymnasium", "numpy", "mujoco", "gymnasium-1.0.dist-info"):
         (site / name).mkdir(parents=True)
     (site / "Box2D.so").touch()
-    found = {Path(path).name for path in hidden_below(str(tmp_path))}
-    assert found == {"gymnasium", "mujoco", "Box2D.so"}
+    names = {Path(path).name for path in hidden_below(str(tmp_path))}
+    assert names == {"gymnasium", "mujoco", "Box2D.so"}
 
 
-def test_what_is_hidden_is_covered_in_a_folder_that_the_operator_shows(tmp_path: Path) -> None:
+def test_hidden_folders_are_covered_in_a_folder_that_the_operator_shows(tmp_path: Path) -> None:
     words = arguments(tmp_path, [], read=(str(tmp_path),))
     covers = [words[i + 1] for i, word in enumerate(words) if word == "--tmpfs"]
     assert str(tmp_path / "runs") in covers
@@ -94,7 +94,7 @@ def test_what_is_hidden_is_covered_in_a_folder_that_the_operator_shows(tmp_path:
     assert shown < words.index(str(tmp_path / "runs"), shown) < words.index(str(tmp_path / "runs" / "w"))
 
 
-def test_what_is_hidden_is_covered_behind_a_link_too(tmp_path: Path) -> None:
+def test_hidden_folders_are_covered_behind_a_link_too(tmp_path: Path) -> None:
     (tmp_path / "all").mkdir()
     link = tmp_path / "link"
     link.symlink_to(tmp_path)

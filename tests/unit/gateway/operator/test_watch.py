@@ -1,4 +1,4 @@
-"""What an operator's terminal is told of runs: what they wait for, and nothing of an agent's that steers it."""
+"""The operator's terminal shows why runs wait, and nothing of an agent's that steers it."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def test_an_agents_words_do_not_steer_the_terminal(text: str) -> None:
     assert all(letter.isprintable() or letter == "\n" for letter in output)
 
 
-def test_what_can_be_shown_is_shown_as_it_is() -> None:
+def test_printable_text_is_shown_as_it_is() -> None:
     text = "Größe ×2, 日本 ✓\nline two"
     assert harmless(text) == text
     assert first_line(text) == "Größe ×2, 日本 ✓"

@@ -65,5 +65,5 @@ def test_a_refused_run_leaves_no_request_and_the_earlier_run(tmp_path: Path) -> 
     operations.refuses = True
     with pytest.raises(ConfigError, match="are public"):
         ask(tmp_path, operations)
-    left = [path.name for path in tmp_path.rglob("*") if path.is_file()]
-    assert left == ["run.json"]
+    files = [path.name for path in tmp_path.rglob("*") if path.is_file()]
+    assert files == ["run.json"]

@@ -34,10 +34,10 @@ def machines_folder(folder: Path) -> Path:
     roles: tuple[tuple[credentials.Role, str], ...] = (("operator", ""), ("gateway", "gateway-"))
     for role, prefix in roles:
         files = TlsFiles(root_ca="ca.pem", certificate=f"{prefix}cert.pem", private_key=f"{prefix}key.pem")
-        found = msgspec.structs.replace(
+        own = msgspec.structs.replace(
             RUNS_OWN, role=role, user=f"{role}/m", token="", endpoints=("tls/lab:7447",), tls=files
         )
-        credentials.write(found, folder / f"{role}.json")
+        credentials.write(own, folder / f"{role}.json")
     return folder
 
 
@@ -57,8 +57,8 @@ def test_a_gateway_speaks_with_its_runs_credentials(run: RunFolder) -> None:
 def test_elsewhere_it_has_that_machines_rights_and_its_runs_capability(
     run: RunFolder, tmp_path: Path
 ) -> None:
-    found, opened = gateway._load(run, (), machines_folder(tmp_path / "m"))
-    assert (found.user, found.token, found.endpoints, opened.run) == (
+    loaded, opened = gateway._load(run, (), machines_folder(tmp_path / "m"))
+    assert (loaded.user, loaded.token, loaded.endpoints, opened.run) == (
         "gateway/m",
         "capability",
         ("tls/lab:7447",),

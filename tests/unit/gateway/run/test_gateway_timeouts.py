@@ -310,6 +310,6 @@ child.wait()
 """
 
 
-def test_what_survives_killing_is_reported() -> None:
+def test_processes_that_survive_killing_are_reported() -> None:
     done = subprocess.run([sys.executable, "-c", UNKILLABLE], capture_output=True, text=True, check=True)
     assert done.stdout == "True\n"

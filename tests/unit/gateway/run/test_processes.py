@@ -90,7 +90,7 @@ sys.exit(breeder.wait())
 """
 
 
-def test_what_a_spared_process_starts_meanwhile_is_spared_too(tmp_path: Path) -> None:
+def test_children_of_a_spared_process_are_spared_too(tmp_path: Path) -> None:
     done, touched = tmp_path / "done", tmp_path / "touched"
     command = [sys.executable, "-c", SEARCHER, BREEDER, str(done), str(touched)]
     assert subprocess.run(command, timeout=600, check=False).returncode == 0

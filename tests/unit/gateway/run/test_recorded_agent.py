@@ -1,4 +1,4 @@
-"""What a replay is refused for, and how it tells its first difference."""
+"""Refusals of a replay, and its report of the first difference."""
 
 from __future__ import annotations
 

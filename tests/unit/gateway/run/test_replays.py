@@ -61,14 +61,14 @@ def fetch(root: Path, run: RunFinished, cluster: Cluster) -> Any:
 
 def test_recordings_are_written_and_told_in_the_splits_order(tmp_path: Path) -> None:
     cluster = Cluster()
-    found = fetch(tmp_path, run_with(replays="all"), cluster)
+    kept = fetch(tmp_path, run_with(replays="all"), cluster)
     assert cluster.asked == [(run_with().run, "heldout", 4)]
-    assert [(each.episode, each.submit_index, each.episode_return, each.length) for each in found] == [
+    assert [(each.episode, each.submit_index, each.episode_return, each.length) for each in kept] == [
         (0, 4, 0.0, 10),
         (1, 4, 1.0, 11),
         (2, 4, 2.0, 12),
     ]
-    assert [(tmp_path / each.path).read_bytes() for each in found] == MP4
+    assert [(tmp_path / each.path).read_bytes() for each in kept] == MP4
 
 
 @pytest.mark.parametrize("settings", [{}, {"video": "all", "replays": "off"}])
@@ -88,7 +88,7 @@ def test_feedback_videos_bring_held_out_recordings_unless_told_otherwise(tmp_pat
     assert [each.episode for each in fetch(tmp_path, run_with(video="first"), Cluster([0]))] == [0]
 
 
-def test_what_was_fetched_before_an_interruption_is_not_fetched_again(tmp_path: Path) -> None:
+def test_videos_fetched_before_an_interruption_are_not_fetched_again(tmp_path: Path) -> None:
     cluster = Cluster()
     cluster.fails[MP4[1]] = TransportError("cut off")
     with pytest.raises(TransportError):

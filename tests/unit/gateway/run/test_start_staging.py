@@ -53,8 +53,8 @@ def test_a_start_gets_the_recorded_workspace_and_no_hidden_result(parent: RunFol
     starts.stage(starts.find(started.start_from, tmp_path), started.folder)
     staging.stage(started.folder, opened(), NO_URLS)
     workspace = started.folder.workspace
-    found = {str(path.relative_to(workspace)) for path in workspace.rglob("*") if path.is_file()}
-    assert found == {
+    files = {str(path.relative_to(workspace)) for path in workspace.rglob("*") if path.is_file()}
+    assert files == {
         "AGENTS.md",
         "history/START.json",
         "history/submit_000/summary.json",

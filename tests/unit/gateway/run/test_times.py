@@ -8,7 +8,7 @@ from evopolicy_common.records.run_record import AgentLimits, AgentResources
 from evopolicy_gateway.run.times import Stopwatch, Times
 
 
-def test_what_processes_tell_adds_up_over_their_deaths_and_over_commands(tmp_path: Path) -> None:
+def test_reported_times_add_up_over_deaths_and_commands(tmp_path: Path) -> None:
     now = [100.0]
     path = tmp_path / "times.json"
     first = Stopwatch(path, lambda: now[0])
@@ -58,7 +58,7 @@ def test_times_that_cannot_be_read_or_written_stop_nothing(tmp_path: Path) -> No
     Stopwatch(tmp_path / "gone" / "times.json").keep()
 
 
-def test_what_killed_and_resumed_agents_used_is_added_up(tmp_path: Path) -> None:
+def test_resources_of_killed_and_resumed_agents_add_up(tmp_path: Path) -> None:
     path = tmp_path / "times.json"
     first = Stopwatch(path)
     limits = AgentLimits(pids=9)

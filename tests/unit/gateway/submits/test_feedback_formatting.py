@@ -296,7 +296,7 @@ def test_an_episode_without_a_step_has_an_empty_trajectory() -> None:
 @pytest.mark.parametrize(
     ("share", "left_out"), [(600, 0), (599, 1), (301, 1), (300, 1), (299, 2), (100, 2), (99, 3), (0, 3)]
 )
-def test_what_does_not_fit_an_episodes_share_is_left_out_in_order(share: int, left_out: int) -> None:
+def test_files_beyond_an_episodes_share_are_left_out_in_order(share: int, left_out: int) -> None:
     files = {"trajectory.jsonl": b"r" * 100, "observations.npz": b"o" * 200, "video.mp4": b"v" * 300}
     kept = within_share(files, share)
     order = [name for name in LEFT_OUT_FIRST if name in files]

@@ -48,7 +48,7 @@ def written(path: Path) -> bytes:
     return path.read_bytes()
 
 
-def test_what_was_appended_is_read_back(tmp_path: Path) -> None:
+def test_appended_entries_are_read_back(tmp_path: Path) -> None:
     written(tmp_path / "j")
     assert entries_in(tmp_path / "j") == ENTRIES
     assert (tmp_path / "j").stat().st_mode & 0o077 == 0

@@ -1,4 +1,4 @@
-"""What a submit takes from `system/`, and the verdicts of folders that cannot be a bundle."""
+"""Snapshots of `system/` for a submit, and the verdicts of folders that cannot be a bundle."""
 
 from __future__ import annotations
 

@@ -62,8 +62,8 @@ class World:
 
     @property
     def state(self) -> RunState:
-        left = min([each.remaining_budget for each in self.accepted.values()], default=BUDGET)
-        return RunState(remaining_budget=left, n_submits=len(self.accepted), is_finalized=False)
+        remaining = min([each.remaining_budget for each in self.accepted.values()], default=BUDGET)
+        return RunState(remaining_budget=remaining, n_submits=len(self.accepted), is_finalized=False)
 
     def start(self) -> None:
         """A gateway starts on the journal."""
@@ -174,8 +174,8 @@ class World:
         assert all(n == 1 for client_key, n in named.items() if client_key is not None)
         noted = [ticket for ticket in machine.tickets if not ended_without_an_entry(ticket)]
         again = TicketMachine(machine.run, dict(enumerate(self.journal)))
-        assert [look(ticket) for ticket in noted if ticket.done] == [
-            look(ticket) for ticket in again.tickets if ticket.done
+        assert [visible(ticket) for ticket in noted if ticket.done] == [
+            visible(ticket) for ticket in again.tickets if ticket.done
         ]
 
 
@@ -197,7 +197,7 @@ def ended_without_an_entry(ticket: Ticket) -> bool:
     return ticket.error is not None and ticket.error.status in ("closed", "cancelled")
 
 
-def look(ticket: Ticket) -> dict[str, Any]:
+def visible(ticket: Ticket) -> dict[str, Any]:
     """The ticket without the identity of its error, and without what is told of a submit in flight only."""
     values = {name: getattr(ticket, name) for name in ticket.__struct_fields__}
     error = ticket.error

@@ -180,8 +180,8 @@ def test_the_tasks_schemas_are_json() -> None:
         },
     }
     text = task_markdown(opened(env=msgspec.structs.replace(LINE, obs_space=space)))
-    found = [json.loads(block) for block in re.findall(r"```json\n(.*?)```", text, re.DOTALL)]
-    assert found == [space, LINE.action_space]
+    blocks = [json.loads(block) for block in re.findall(r"```json\n(.*?)```", text, re.DOTALL)]
+    assert blocks == [space, LINE.action_space]
 
 
 def test_info_has_the_protocols_fields_and_no_more_of_the_cluster() -> None:
@@ -198,11 +198,11 @@ def test_info_has_the_protocols_fields_and_no_more_of_the_cluster() -> None:
     assert info_document(machine)["state"]["is_finalized"] is True
 
 
-@pytest.mark.parametrize("left", ["first", ".first.lock", ".first.asked"])
-def test_a_run_of_an_earlier_version_keeps_its_folder(left: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize("existing", ["first", ".first.lock", ".first.asked"])
+def test_a_run_of_an_earlier_version_keeps_its_folder(existing: str, tmp_path: Path) -> None:
     earlier = tmp_path / "e" / "my_env:Glider-v0"
     earlier.mkdir(parents=True)
-    (earlier / left).touch()
+    (earlier / existing).touch()
     assert run_folder(tmp_path, "e", "my_env:Glider-v0", "first").root == earlier / "first"
     new = run_folder(tmp_path, "e", "my_env:Glider-v0", "second").root
     assert new == tmp_path / "e" / "my_env_Glider-v0" / "second"
