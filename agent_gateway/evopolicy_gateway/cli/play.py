@@ -291,9 +291,7 @@ def _plans(given: RunOptions, env_ids: list[str], agent_host: str = "", **more: 
 
 
 def _play(plans: list[Plan], where: Cluster, parallel: int, as_json: bool, *, web: bool = False) -> None:
-    # Whether an agent or a policy could read what this user can.
-    unjailed = any(plan.jail.mode != "bwrap" or plan.settings.sandbox_tier == "none" for plan in plans)
-    where = msgspec.structs.replace(where, unjailed=unjailed, web=plans[0].runs if web else None)
+    where = msgspec.structs.replace(where, unjailed=_unjailed(plans), web=plans[0].runs if web else None)
     console = terminal(stderr=as_json)
     try:
         played = run_to_end(plain_runs.play(plans, where, parallel, console))
@@ -304,3 +302,8 @@ def _play(plans: list[Plan], where: Cluster, parallel: int, as_json: bool, *, we
     else:
         plain_runs.report(played, plans[0].runs, console)
     raise typer.Exit(exit_code(plans, played.index))
+
+
+def _unjailed(plans: list[Plan]) -> bool:
+    """Whether an agent or a policy could read the files of this user."""
+    return any(plan.jail.mode != "bwrap" or plan.settings.sandbox_tier == "none" for plan in plans)

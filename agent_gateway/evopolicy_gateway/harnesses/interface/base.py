@@ -97,8 +97,6 @@ class Stage(msgspec.Struct, frozen=True, kw_only=True):
         return await asyncio.to_thread(_get_json, self.urls["EVOPOLICYGYM_INFO_URL"])
 
 
-
-
 class Harness(ABC):
     """One kind of agent."""
 
