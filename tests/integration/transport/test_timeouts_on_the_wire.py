@@ -79,9 +79,10 @@ async def test_operators_commands_give_up(tmp_path: Path) -> None:
             await Operations(link).cancel("r")
         verification: Any = object.__new__(verify_run.Verifier)
         verification._evaluations = Evaluations(link, lambda count, waits_for: None)
+        verification._knows_run = True
         verification._run = SimpleNamespace(record=SimpleNamespace(run="r"))
         with pytest.raises(TransportError):
-            await verification._stored(SimpleNamespace(split="train", submit_index=0))
+            await verification._recordings(SimpleNamespace(split="train", submit_index=0), [0])
 
 
 async def test_info_is_answered_without_a_state_that_does_not_come(

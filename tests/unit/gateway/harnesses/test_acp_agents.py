@@ -130,7 +130,7 @@ def test_permissions_follow_the_rules_and_this_side_is_out_of_reach(tmp_path: Pa
     run = played(tmp_path, "asks", budget=2)
     answers = [line.rpartition(" ")[2] for line in kept(run, "permissions")]
     assert answers == ["reject_once", "reject_once", "reject_once", "allow_once", "allow_once"]
-    assert all("Method not run" in line for line in kept(run, "refused"))
+    assert all("Method not found" in line for line in kept(run, "refused"))
     assert [line["outcome"] for line in run.log if line.get("type") == "permission"] == ["selected"] * 5
 
 
