@@ -39,6 +39,8 @@ _ONE_BY_ONE = (
     "tests/unit/worker/runtime/test_foreign_slots.py::",
 )
 """Their tests share nothing and take minutes together: each is played where there is room."""
+_SHARED = ("cheated", "forked")
+"""Fixtures that files share: a cluster to be cheated, and a process with all commands imported."""
 
 
 @pytest.hookimpl(tryfirst=True)
@@ -47,8 +49,16 @@ def pytest_runtestloop(session: pytest.Session) -> bool | None:
     processes = session.config.getoption("processes")
     if not processes or session.testsfailed or session.config.option.collectonly:
         return None
-    Parallel(session, lambda item: item if item.nodeid.startswith(_ONE_BY_ONE) else item.path).play(processes)
+    Parallel(session, _group).play(processes)
     return True
+
+
+def _group(item: pytest.Item) -> object:
+    """Tests of one group are played by one process: those of a file, or of a fixture that takes seconds to set up."""
+    if item.nodeid.startswith(_ONE_BY_ONE):
+        return item
+    fixtures = getattr(item, "fixturenames", ())
+    return next((name for name in _SHARED if name in fixtures), item.path)
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:

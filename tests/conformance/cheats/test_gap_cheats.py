@@ -25,7 +25,7 @@ def collected(slots: Slots, env: str, action: Any, seed: int, **options: Any) ->
     ("env", "action", "per_policy", "video"),
     [
         pytest.param("gym/acrobot", 1, 1, False, id="numbers", marks=pytest.mark.system),
-        pytest.param("gym/acrobot", 1, 4, True, id="numbers and pauses for videos"),
+        pytest.param("gym/acrobot", 1, 4, True, id="numbers and pauses for videos", marks=pytest.mark.system),
         pytest.param("gymnasium/ALE/Pong-v5", 0, 1, False, id="pictures"),
         pytest.param(
             "gymnasium/ALE/Pong-v5", 0, 4, False, id="pictures and pauses", marks=pytest.mark.system

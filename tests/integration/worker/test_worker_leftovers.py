@@ -94,7 +94,7 @@ def test_a_worker_killed_during_its_start_leaves_nothing(tmp_path: Path) -> None
     assert semaphores() <= before
 
 
-@pytest.mark.parametrize("kills", [2, capabilities.TRIES])
+@pytest.mark.parametrize("kills", [2, pytest.param(capabilities.TRIES, marks=pytest.mark.system)])
 def test_a_describing_process_that_is_killed_is_started_again(
     tmp_path: Path, kills: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:

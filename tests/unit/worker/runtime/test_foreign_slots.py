@@ -3,7 +3,7 @@ break is told."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +23,14 @@ from evopolicy_worker.slots import slot as slot_module
 from evopolicy_worker.slots.slot import Slot
 
 pytestmark = pytest.mark.slow
+
+OFTEN = ("nan", "raise in reset, later", "custom space", "exit", "hang", "raise in reset", "leak")
+"""Faults that `make test` plays; the others start as many processes, and are played in the system's layer."""
+
+
+def faults(names: Iterable[str]) -> list[Any]:
+    return [pytest.param(name, marks=() if name in OFTEN else pytest.mark.system) for name in names]
+
 
 PACKAGE = Path(__file__).parents[3] / "support" / "foreign_package"
 
@@ -104,35 +112,31 @@ def test_success_of_hidden_episodes_is_recorded_where_the_definition_names_none(
     assert train.success is None  # an agent's feedback is as it was
 
 
-@pytest.mark.parametrize(
-    ("how", "why"),
-    [
-        ("nan", "environment acme/Bad, step 0, reward: it is nan"),
-        ("outside", "environment acme/Bad, step 0, observation: element"),
-        ("raise in reset", "environment acme/Bad, reset: it raised RuntimeError"),
-        ("change spaces", "environment acme/Bad, reset, observation_space: it has changed"),
-        ("no bounds", "environment acme/Bad, action_space"),
-        ("custom space", "environment acme/Bad, observation_space: a space of type Opaque"),
-        ("exit", "environment acme/Bad: its process ended while it was tried out"),
-        (
-            "leave",
-            "environment acme/Bad, step 0: it raised SystemExit: no more levels; it has to take any action",
-        ),
-        ("interrupt", "environment acme/Bad, step 0: it raised KeyboardInterrupt"),
-        (
-            "raise in reset, later",
-            "environment acme/Bad, reset: it raised RuntimeError: no level of that seed",
-        ),
-        ("hang", "environment acme/Bad, step 0: it has not returned for 4 s"),
-        ("hang in make", "environment acme/Bad, make: it has not returned for 4 s"),
-        ("hang in close", "environment acme/Bad, close: it has not returned for 4 s"),
-        ("hold", "environment acme/Bad, make, reset or step: it has not returned for 4 s"),
-    ],
-)
+REFUSED = {
+    "nan": "environment acme/Bad, step 0, reward: it is nan",
+    "outside": "environment acme/Bad, step 0, observation: element",
+    "raise in reset": "environment acme/Bad, reset: it raised RuntimeError",
+    "change spaces": "environment acme/Bad, reset, observation_space: it has changed",
+    "no bounds": "environment acme/Bad, action_space",
+    "custom space": "environment acme/Bad, observation_space: a space of type Opaque",
+    "exit": "environment acme/Bad: its process ended while it was tried out",
+    "leave": "environment acme/Bad, step 0: it raised SystemExit: no more levels; it has to take any action",
+    "interrupt": "environment acme/Bad, step 0: it raised KeyboardInterrupt",
+    "raise in reset, later": "environment acme/Bad, reset: it raised RuntimeError: no level of that seed",
+    "hang": "environment acme/Bad, step 0: it has not returned for 4 s",
+    "hang in make": "environment acme/Bad, make: it has not returned for 4 s",
+    "hang in close": "environment acme/Bad, close: it has not returned for 4 s",
+    "hold": "environment acme/Bad, make, reset or step: it has not returned for 4 s",
+}
+"""A slot's error for an environment that is tried out."""
+
+
+@pytest.mark.parametrize("how", faults(REFUSED))
 def test_an_environment_that_breaks_its_description_is_refused(
-    slots: Slots, how: str, why: str, monkeypatch: pytest.MonkeyPatch
+    slots: Slots, how: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(slot_module, "SILENT_S", 8.0)
+    why = REFUSED[how]
     how, later, _ = how.partition(", later")
     # After the trial, steps are timed in episodes of other seeds.
     kwargs = {"how": how, "seeds_from": 2 if later else 0}
@@ -186,7 +190,7 @@ class Policy:
 """Throws by the clock, then pushes."""
 
 
-@pytest.mark.parametrize("how", WRONG)
+@pytest.mark.parametrize("how", faults(WRONG))
 def test_what_prevents_an_episode_is_reported_by_name_and_is_nobodys_result(
     slots: Slots, how: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -211,7 +215,7 @@ def test_what_prevents_an_episode_is_reported_by_name_and_is_nobodys_result(
         assert slots.play_all(None, slot=slot, env="toy/line")[0].length > 0
 
 
-@pytest.mark.parametrize("how", ["hold", "hang"])
+@pytest.mark.parametrize("how", faults(["hold", "hang"]))
 def test_an_environment_that_hangs_on_actions_gives_no_second_throw(
     slots: Slots, how: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
