@@ -7,6 +7,8 @@ import csv
 from importlib.resources import files
 from pathlib import Path
 
+import pytest
+
 from evopolicy_common import catalogue
 from evopolicy_common.messages.environment import Case
 from evopolicy_common.messages.episode import EpisodeSpec, Job
@@ -47,6 +49,7 @@ async def play(slot: Slot, env: str) -> float:
     return sum(outcome.episode_return for outcome in outcomes) / N_CASES
 
 
+@pytest.mark.system
 def test_examples_reach_half_of_the_papers_best_on_twelve_of_sixteen(tmp_path: Path) -> None:
     async def scenario() -> dict[str, float]:
         slot = Slot(None, "bwrap", tmp_path / "slot")

@@ -230,6 +230,7 @@ def test_a_gateway_stopped_in_a_submit_shows_no_error(
     assert [record.message for record in caplog.records if record.exc_info] == []
 
 
+@pytest.mark.system
 async def test_a_gateway_keeps_nothing_of_the_episodes_that_it_has_answered(tmp_path: Path) -> None:
     n, cases = 100, tuple(range(1001, 1201, 2))
 

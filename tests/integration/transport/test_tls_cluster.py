@@ -168,6 +168,7 @@ async def test_machines_reconnect_after_an_issue_or_a_restart(certs: OwnCerts) -
 
 
 @pytest.mark.slow  # until the certificate is over, and the leases
+@pytest.mark.system
 async def test_a_worker_goes_on_with_a_renewed_certificate_in_a_run(
     certs: OwnCerts, coordinator: Coordinator
 ) -> None:

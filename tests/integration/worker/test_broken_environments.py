@@ -17,6 +17,8 @@ from waiting import wait_until
 from evopolicy_common.errors import RefusedError
 from evopolicy_common.messages import operator
 
+pytestmark = [pytest.mark.system, pytest.mark.slow]
+
 PACKAGE = Path(__file__).parents[2] / "support" / "foreign_package"
 POLICY = """
 class Policy:
@@ -32,8 +34,6 @@ how = "{how}"
 seeds_from = 100
 """
 """It keeps its word while it is tried out and measured, with small seeds, and breaks it in episodes that count."""
-QUICK = ("exit",)
-"""That of `make test`; the slot's process starts five times in each."""
 PROBLEMS = {
     "hang": "environment acme/bad, step 0: it has not returned for 4 s, the limit of one call",
     "hang in reset": "environment acme/bad, reset: it has not returned for 4 s",
@@ -62,12 +62,7 @@ def worker(
     process.wait(timeout=60)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("worker", "how"),
-    [pytest.param(how, how, marks=() if how in QUICK else pytest.mark.system) for how in PROBLEMS],
-    indirect=["worker"],
-)
+@pytest.mark.parametrize(("worker", "how"), [(how, how) for how in PROBLEMS], indirect=["worker"])
 def test_a_broken_environment_is_reported_and_charges_nothing(
     tmp_path: Path, coordinator: Coordinator, worker: subprocess.Popen[bytes], how: str
 ) -> None:

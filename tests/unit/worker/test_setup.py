@@ -147,6 +147,7 @@ def test_a_browser_that_setup_may_not_or_cannot_install_is_reported(
 
 
 @pytest.mark.slow
+@pytest.mark.system
 def test_a_package_index_that_cannot_be_reached_is_reported(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

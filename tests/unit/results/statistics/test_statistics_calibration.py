@@ -54,7 +54,7 @@ def test_an_interval_that_forgot_the_runs_would_not_cover() -> None:
     assert coverage(one_run_each, TRIALS).share < 0.75
 
 
-@pytest.mark.parametrize("n_runs", [(4,), (10,), (2, 10, 3, 5)])
+@pytest.mark.parametrize("n_runs", [pytest.param((4,), marks=pytest.mark.system), (10,), (2, 10, 3, 5)])
 @pytest.mark.parametrize("interaction", [0.5, pytest.param(1.0, marks=pytest.mark.system)])
 def test_agents_that_differ_by_case_are_told_apart_as_rarely_as_stated(
     n_runs: tuple[int, ...], interaction: float

@@ -163,6 +163,7 @@ def test_a_number_without_measure_reads_as_no_float() -> None:
     assert not reads_as(10**400, np.float32(1.0))
 
 
+@pytest.mark.system
 def test_rows_of_many_values_are_not_all_in_memory_at_once(tmp_path: Path) -> None:
     line = '{"t":0,"action":0,"reward":0.0,"info":{"x":[%s[]]}}\n' % ("[]," * 30_000)
     (tmp_path / "trajectory.jsonl").write_text(line * 30)

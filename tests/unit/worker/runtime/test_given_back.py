@@ -93,7 +93,14 @@ def test_a_policy_that_uses_the_clock_draws_once_despite_stops(slots: Slots, tie
         assert longer[: len(shorter)] == shorter
 
 
-@pytest.mark.parametrize("tier", ["bwrap", "landlock", "none"])
+@pytest.mark.parametrize(
+    "tier",
+    [
+        "bwrap",
+        pytest.param("landlock", marks=pytest.mark.system),
+        pytest.param("none", marks=pytest.mark.system),
+    ],
+)
 def test_actions_stand_when_the_process_of_the_environment_is_killed(slots: Slots, tier: str) -> None:
     slot = slots.new(tier)  # type: ignore[arg-type]
     job = hidden(tier=tier)

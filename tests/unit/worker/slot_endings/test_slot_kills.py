@@ -29,7 +29,9 @@ def test_a_policy_killed_from_outside_restarts_unnoticed(slots: Slots, tier: str
     assert any("a policy is started again" in line for line in slot._stderr)
 
 
-@pytest.mark.parametrize("tier", ["bwrap", "landlock", "none"])
+@pytest.mark.parametrize(
+    "tier", ["bwrap", *(pytest.param(k, marks=pytest.mark.system) for k in ("landlock", "none"))]
+)
 def test_a_batch_systems_sigterm_to_every_process_ends_nothing(slots: Slots, tier: str) -> None:
     undisturbed = slots.play(stateful(0.0), tier=tier, limits=PATIENT)
     slot = slots.slot(tier)  # type: ignore[arg-type]
@@ -124,7 +126,7 @@ def test_a_process_killed_before_its_policy_is_no_loss(slots: Slots, tier: str) 
 SLOW = stateful(0.05, at=10).replace("self.n == 10", "self.n % 10 == 0")
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", [0, *(pytest.param(k, marks=pytest.mark.system) for k in (1, 2))])
 def test_an_episode_under_kills_and_stops_of_anything_is_the_same_episode(slots: Slots, seed: int) -> None:
     undisturbed = slots.play(SLOW, limits=PATIENT)
     dice = random.Random(seed)
