@@ -28,7 +28,7 @@ def tap(file: Path, leak: Path) -> None:
     out = file.open("ab", buffering=0)
     lock = threading.Lock()
     returns: list[float] = []
-    send, arrived = Server.send, Server._arrived
+    reply, arrived = IncomingQuery.reply, Server._arrived
 
     def note(way: str, key: str, payload: bytes) -> None:
         data = msgspec.msgpack.encode((way, key, payload))
@@ -47,11 +47,11 @@ def tap(file: Path, leak: Path) -> None:
         episodes = [msgspec.structs.replace(one, stdout=one.stdout + planted) for one in page.episodes]
         return codec.encode(msgspec.structs.replace(page, episodes=tuple(episodes)))
 
-    def tapped_send(self: Server, lane: int, query: zenoh.Query, key: str, payload: bytes) -> None:
-        if "/gw/" in key and leak.exists():
+    def tapped_reply(self: IncomingQuery, payload: bytes, lane: int = 0) -> None:
+        if "/gw/" in self.key and leak.exists():
             payload = leaky(payload)
-        note("answer", key, payload)
-        send(self, lane, query, key, payload)
+        note("answer", self.key, payload)
+        reply(self, payload, lane)
 
     def tapped_arrived(self: Server, query: zenoh.Query) -> None:
         asked = IncomingQuery(self, query)
@@ -62,7 +62,7 @@ def tap(file: Path, leak: Path) -> None:
             returns.extend(one.episode_return for result in message.results for one in result.episodes)
         arrived(self, query)
 
-    Server.send = tapped_send  # type: ignore[method-assign]
+    IncomingQuery.reply = tapped_reply  # type: ignore[method-assign]
     Server._arrived = tapped_arrived  # type: ignore[method-assign]
 
 
