@@ -57,6 +57,7 @@ def test_a_description_says_what_the_catalogue_says(env_id: str, warm: Warm) -> 
 
 
 @pytest.mark.parametrize("env_id", IDS)
+@pytest.mark.system
 def test_a_steps_feedback_takes_about_what_the_catalogue_says(env_id: str, warm: Warm) -> None:
     environment = warm(env_id)
     rng = np.random.default_rng(0)

@@ -228,6 +228,7 @@ def test_without_the_seal_the_same_code_succeeds(slots: Slots, attack: Breaker) 
 @pytest.mark.parametrize(
     "attack", [attack for attack in BREAKERS if attack.in_process], ids=lambda attack: attack.name
 )
+@pytest.mark.system
 def test_in_the_environments_own_process_the_same_code_does_harm(attack: Breaker) -> None:
     assert harmed(attack.source) is not None
 

@@ -64,6 +64,7 @@ def test_keys_of_a_command_line_reach_the_agent_and_no_file(folder: Path) -> Non
     assert PASSED.encode() not in private.read_bytes()
 
 
+@pytest.mark.system
 def test_a_passed_value_in_a_policy_stops_publish_until_decided(folder: Path) -> None:
     root = folder.parents[3]
     place = f"{folder.relative_to(root)}/checkpoints/submit_000/policy.py:2"

@@ -175,6 +175,7 @@ def test_index_is_self_contained(report: Path) -> None:
     assert text.count('<svg role="img"') == len(list((report / "figures").glob("*.svg")))
 
 
+@pytest.mark.system
 def test_progress_of_each_stage_has_a_total_that_stays(runs: Path, tmp_path: Path) -> None:
     told: dict[str, list[tuple[int, int]]] = {}
     found = study([runs])
@@ -230,6 +231,7 @@ def test_left_out_run_is_listed_with_its_reason(report: Path) -> None:
     assert row["path"] in (report / "index.html").read_text()
 
 
+@pytest.mark.system
 def test_report_is_the_same_whether_one_or_two_processes_make_it(tmp_path: Path) -> None:
     for folder in write_suite(tmp_path / "runs", environments=("gym/racing", "own/glider"), n_submits=4):
         amend(folder, {"env_title": "Glider"} if "glider" in str(folder) else {})

@@ -140,7 +140,8 @@ class Stored:
         return []
 
 
-@pytest.mark.parametrize("restart", [pytest.param(False, marks=pytest.mark.system), True])
+@pytest.mark.parametrize("restart", [False, True])
+@pytest.mark.system
 def test_an_agent_that_stops_its_validation_again_and_again_gets_one_throw(
     tmp_path: Path, restart: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:

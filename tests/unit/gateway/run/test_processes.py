@@ -83,7 +83,7 @@ import subprocess, sys
 from evopolicy_gateway.processes import trees as processes
 processes.become_subreaper()
 breeder = subprocess.Popen([sys.executable, "-c", sys.argv[1], *sys.argv[2:]])
-for _ in range(100):  # a search that looks twice at the processes touches one in every twentieth
+for _ in range(60):  # a search that looks twice at the processes touches one in every twentieth
     processes.end_orphans({breeder.pid})
 open(sys.argv[2], "w").close()
 sys.exit(breeder.wait())

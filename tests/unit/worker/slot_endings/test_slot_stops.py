@@ -104,6 +104,7 @@ COMPUTES = acting(
 )
 
 
+@pytest.mark.system
 def test_no_wall_limit_counts_time_without_a_processor(slots: Slots) -> None:
     slot = slots.slot()
     # Long enough to be moved in, well within what an answer may take.
