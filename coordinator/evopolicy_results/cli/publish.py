@@ -29,7 +29,7 @@ from evopolicy_common.regular_files import read_given
 from evopolicy_common.terminal import counted, one_line, say, say_json
 from evopolicy_results.cli.cluster import Local, Runs, State, Where, first
 from evopolicy_results.publish import replay as replays
-from evopolicy_results.publish import rules, run_rules
+from evopolicy_results.publish import rules
 from evopolicy_results.publish.archive import Archive
 from evopolicy_results.publish.collect import Published, Publisher, find_runs, needles_of_this_machine
 from evopolicy_results.publish.contents import Countersignature, Listed
@@ -183,7 +183,6 @@ def check(
         try:
             with Archive(file) as archive:
                 checked = rules.check(archive, identity or "", noted)
-                run_rules.scan_published(archive, checked)
                 contradicts = checked.failed
                 if share is None:
                     checked.add("replay", "open", "not asked for; --replay 5% plays recorded actions again")

@@ -21,10 +21,8 @@ from evopolicy_results.html import notice, section, visible
 from evopolicy_results.reading.agent_log import Evidence
 from evopolicy_results.reading.environments import grouped, title_of
 from evopolicy_results.reading.records import Run, Submit
-from evopolicy_results.scan.signals import TITLES
 from evopolicy_results.studies.palette import Look
 from evopolicy_results.studies.study import Study
-from evopolicy_results.tables.run_tables import submits_text
 from evopolicy_results.tables.table import Column, Table, shown
 
 _FILTER_FROM = 9
@@ -53,7 +51,7 @@ def environment() -> Environment:
         finalize=visible,
     )
     made.globals["inline"] = lambda plot: Markup(inline_svg(plot.svg, plot.name, plot.alt))
-    made.globals |= {"title_of": title_of, "titles": TITLES, "submits_text": submits_text}
+    made.globals["title_of"] = title_of
     for name in ("report.css", "report.js"):
         made.globals[name.split(".")[1]] = Markup(folder.joinpath(name).read_text(encoding="utf-8"))
     return made
@@ -110,7 +108,7 @@ _SECTIONS = (
     _Section("edits", "Edits", "What edits do", "", "edit_hits edit_size", "edit_types edit_sizes"),
     _Section("timelines", "Timelines", "Code-phase timelines"),
     _Section("structure", "Structure", "Realised structure", "", "structure", "structure"),
-    _Section("cost", "Cost and audit", "", "", "tokens wall_time", "tokens audit signals simulator_flags"),
+    _Section("cost", "Cost and audit", "", "", "tokens wall_time", "tokens audit"),
     _Section(
         "feedback",
         "Feedback use",
@@ -213,9 +211,6 @@ def index_page(
 _NOTICES: tuple[tuple[Callable[[Run], bool], str], ...] = (
     (lambda run: not run.record.versions.data_secret,
      "played public splits, of case files or a public seed: agents and models may know the hidden cases."),
-    (lambda run: bool(run.simulator_flags),
-     "have code that looks like a simulator, which their rules forbid: a signal to read, never a verdict."),
-    (lambda run: bool(run.signals), "have signals in their log or code that deserve a look; none is a verdict."),
     (lambda run: run.simulation_allowed,
      "let their agent simulate, or are from before there was a rule against it."),
     (lambda run: run.record.jail == "none", "had no jail around their agent."),
@@ -336,7 +331,6 @@ def trace_page(
         image_links=image_links,
         videos=videos,
         unplaced=trace.unplaced,
-        signals=[each for each in run.signals if each not in run.simulator_flags],
         checkpoints=_checkpoints(trace),
     )
 

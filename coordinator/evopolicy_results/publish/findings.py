@@ -35,7 +35,6 @@ KINDS = {
     "scores": "scores follow from the returns of the episodes",
     "recordings": "returns follow from the recorded rewards",
     "checkpoints": "the policies are those that were submitted",
-    "signals": "no signals in checkpoints and logs (no verdict)",
     "logs": "agents' logs are what the agents wrote",
     "card": "the evaluation card and its descriptions follow from the runs",
     "completeness": "every run that was opened for the entries is here",

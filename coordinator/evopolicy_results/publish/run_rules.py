@@ -1,5 +1,5 @@
 """The rules of `evopolicy check` for one run: its documents against the journal, against each other, and against its
-recordings; and the search of its checkpoints and log for signals, which is never `failed`."""
+recordings."""
 
 from __future__ import annotations
 
@@ -25,8 +25,6 @@ from evopolicy_common.terminal import counted
 from evopolicy_results.publish import contents, fields
 from evopolicy_results.publish.contents import Group
 from evopolicy_results.publish.findings import KINDS, Checked, Fault, Files, History, PublishedRun, decoded
-from evopolicy_results.scan.run import scan
-from evopolicy_results.scan.signals import TITLES, Signal
 from evopolicy_results.verify.numbers import outcome_pairs, short
 
 _SHOWN = 8
@@ -391,37 +389,3 @@ def _metrics(run: PublishedRun, policies: dict[int, Bundle], checked: Checked) -
     for name, here, fixed in pairs:
         if contents.document(here) != contents.document(fixed):
             yield f"run.json tells {name} {short(here)}; the policies give {short(fixed)}"
-
-
-def scan_published(files: Files, checked: Checked) -> None:
-    """Adds a finding for each place in checkpoints and logs that a person should read, or one `ok` for a run without
-    any."""
-    for run in checked.runs:
-        name = run.opening.run
-        try:
-            signals = [
-                f"{TITLES[one.kind]}: {one.path}: {one.reason}: {one.quote}" for one in _signals(files, run)
-            ]
-        except ProtocolError as error:
-            checked.add("signals", "open", f"not searched: {error}", name)
-            continue
-        if len(signals) > _SHOWN:
-            signals[_SHOWN:] = [f"{len(signals) - _SHOWN} more signals"]
-        for text in signals:
-            checked.add("signals", "open", text, name)
-        if not signals:
-            checked.add("signals", "ok", "no signal", name)
-
-
-def _signals(files: Files, run: PublishedRun) -> tuple[Signal, ...]:
-    log = f"{run.folder}/{contents.LOG}"
-    lines = files.read(log, contents.MAX_DOCUMENT_BYTES).splitlines() if log in files.names else ()
-
-    def trajectories(index: int) -> Iterator[list[object]]:
-        for data in run.recordings(files, contents.group_name("train", index)):
-            if data is not None:
-                yield list(recording_of(data).actions)
-
-    policies = run.bundles(files).items()
-    checkpoints = ((index, {file.path: file.data for file in bundle.files}) for index, bundle in policies)
-    return scan(checkpoints, lines, trajectories)

@@ -44,8 +44,6 @@ from evopolicy_results.reading import published
 from evopolicy_results.reading.parallel import ALONE, Processes
 from evopolicy_results.reading.published import PUBLISHED, PublishedSummary
 from evopolicy_results.reading.records import LeftOut, Run, Source, Submit, checkpoint_folder
-from evopolicy_results.scan.run import feedback_actions, log_lines, policy_files, scan, workspace_files
-from evopolicy_results.scan.signals import Signal
 
 Files = Mapping[str, bytes]
 
@@ -162,25 +160,11 @@ def read_run(folder: Path) -> Run:
     run = Run(path=folder, record=record, submits=_read_submits(folder, record))
     if outcome.status == "completed" and run.selected is None:
         raise UnreadableRunError(f"the selected submit {outcome.best_submit_index} has no files")
-    run = replace(run, signals=_signals(run))
     try:
         check_plausible({"run.json": run.record, "submits": run.submits})
     except ValueError as error:
         raise UnreadableRunError(str(error)) from error
     return run
-
-
-def _signals(run: Run) -> tuple[Signal, ...]:
-    checkpoints = (
-        (submit.index, policy_files(policy_folder(run.checkpoint(submit.index)))) for submit in run.submits
-    )
-    return scan(
-        checkpoints,
-        log_lines(run.path / (run.record.artifacts.logs_agent or "logs/agent.jsonl")),
-        lambda index: feedback_actions(run.feedback(index)),
-        env="" if run.simulation_allowed else run.env,
-        workspace={} if run.simulation_allowed else workspace_files(run.workspace),
-    )
 
 
 def _read_record(folder: Path) -> RunRecord:

@@ -18,7 +18,6 @@ from evopolicy_common.records.run_record import RunRecord
 from evopolicy_results.code.topology import Features
 from evopolicy_results.reading.environments import by_name, grouped, ordered_environments
 from evopolicy_results.reading.published import PUBLISHED
-from evopolicy_results.scan.signals import Signal
 
 EditType = Literal["first", "synthesis", "parametric", "rollback", "retest", "data"]
 """Relation of a score-bearing submit to the one before it; see `edits`."""
@@ -79,19 +78,12 @@ class Run(msgspec.Struct, frozen=True, kw_only=True):
     record: RunRecord
     submits: tuple[Submit, ...]
     """In order of their index."""
-    signals: tuple[Signal, ...] = ()
-    """Signals in its log and code for human review."""
     rescore: RescoreRecord | None = None
     """The re-score that the record's held-out results were replaced by; None for the run's own."""
 
     @property
     def simulation_allowed(self) -> bool:
         return self.record.experiment_dimensions.simulation == "allowed"
-
-    @property
-    def simulator_flags(self) -> tuple[Signal, ...]:
-        """Signals of a simulator; none when the run's rules allow simulation."""
-        return () if self.simulation_allowed else tuple(s for s in self.signals if s.kind == "simulator")
 
     @property
     def entry(self) -> str:

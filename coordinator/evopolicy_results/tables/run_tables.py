@@ -1,4 +1,4 @@
-"""The report's tables about the runs: setups of agents and environments, the runs, their audit signals, their submits
+"""The report's tables about the runs: setups of agents and environments, the runs, their diagnostics, their submits
 with the preceding feedback, and the omitted runs."""
 
 from __future__ import annotations
@@ -24,7 +24,6 @@ from evopolicy_results.reading.environments import (
     title_of,
 )
 from evopolicy_results.reading.records import Run, path_text
-from evopolicy_results.scan.signals import TITLES
 from evopolicy_results.studies.study import Study
 from evopolicy_results.tables.table import Column, Kind, Table, at, rows_of, tabulated
 
@@ -44,8 +43,6 @@ _JOURNAL = (
 
 
 def tables_of_runs(study: Study) -> list[Table]:
-    signals = [_Of(run, each) for run in study.runs for each in run.signals]
-    simulators = [_Of(run, each) for run in study.runs for each in run.simulator_flags]
     published = [run for run in study.runs if run.is_published]
     missing = [
         (table, value, sum(not (path and at(run, path)) for run in published))
@@ -68,8 +65,6 @@ def tables_of_runs(study: Study) -> list[Table]:
             run=lambda run: run.name,
         ),
         _audit(study.runs),
-        _evidence("signals", "What deserves a look", signals, _SIGNALS),
-        _evidence("simulator_flags", "Code that looks like a simulator", simulators, _SIMULATORS),
         _agents(study.runs),
         _environments(study.runs),
         tabulated(
@@ -193,7 +188,7 @@ def _environments(runs: Iterable[Run]) -> Table:
 
 
 class _Of(NamedTuple):
-    """A submit's row of a trace, or a signal, with its run."""
+    """A submit's row of a trace, with its run."""
 
     run: Run
     each: Any
@@ -277,8 +272,6 @@ def _audit_row(run: Run) -> dict[str, Any]:
         "hidden_isolation": record.hidden_isolation,
         "hidden_cases": dimensions.hidden_cases,
         "simulation": dimensions.simulation,
-        "simulator_flags": None if run.simulation_allowed else len(run.simulator_flags),
-        "signals": len(run.signals),
         "selected": None if selected is None else f"s{selected:03d}",
         "splits": "secret" if record.versions.data_secret else "public",
     }
@@ -295,10 +288,8 @@ def _repaired_rate(transitions: object) -> float | None:
 
 def _audit(runs: Iterable[Run]) -> Table:
     """Diagnostics: no score depends on them. Runs of the published software record only some of them."""
-    flags = "Places in its code that look like a simulator: a signal to read, never a verdict."
     repaired = "Share of the train steps whose action was outside the action space."
     splits = "`public`: of case files or a public seed that anybody may know."
-    looks = "Places in its log and code that deserve a look: no verdict."
     return Table(
         name="audit",
         title="Audit signals",
@@ -325,8 +316,6 @@ def _audit(runs: Iterable[Run]) -> Table:
             Column("retries", "Retries", "integer"),
             Column("splits", "Splits", note=splits),
             Column("simulation", "Simulation", note="Whether the run's rules let the agent simulate."),
-            Column("simulator_flags", "Simulator flags", "integer", note=flags),
-            Column("signals", "Signals", "integer", note=looks),
             *(
                 Column(phase, f"{phase.removesuffix('_s').capitalize()} (s)", "number", digits=0)
                 for phase in ("wall_s", *PHASES)
@@ -335,47 +324,6 @@ def _audit(runs: Iterable[Run]) -> Table:
         rows=tuple(map(_audit_row, runs)),
         runs=tuple(run.name for run in runs),
     )
-
-
-_SIMULATORS = (
-    "A signal to read, never a verdict: imports and installations of a simulator, and code with a loop and several"
-    " numbers of the environment's dynamics. Simulators that an agent writes itself are seldom found. Runs whose rules"
-    " allow simulation are left out."
-)
-_SIGNALS = (
-    "Signals to read, never verdicts: commands that reach for the network, for files outside the workspace or for a"
-    " simulator, policies with tables keyed by hashes of observations or by case, and policies that hold recorded train"
-    " actions. Honest agents can raise a signal, and an agent can hide from the search."
-)
-
-
-def _evidence(name: str, title: str, signals: list[_Of], caption: str) -> Table:
-    return tabulated(
-        name,
-        title,
-        (
-            *_FEEDBACK[:3],
-            Column("signal", "Signal", of=lambda one: TITLES[one.each.kind]),
-            Column("file", "File", of="each.place"),
-            Column("submits", "Submits", of=lambda one: submits_text(one.each.submits) or None),
-            Column("reason", "Why", of="each.reason"),
-            Column("quote", "Evidence", of=lambda one: one.each.quote[:_MAX_QUOTE]),
-        ),
-        signals,
-        caption,
-        run=lambda one: one.run.name,
-    )
-
-
-def submits_text(indices: Iterable[int]) -> str:
-    """Submit labels such as `s000–s003, s007`: neighbours as a range."""
-    spans: list[list[int]] = []
-    for index in sorted(indices):
-        if spans and index == spans[-1][1] + 1:
-            spans[-1][1] = index
-        else:
-            spans.append([index, index])
-    return ", ".join(f"s{a:03d}" if a == b else f"s{a:03d}–s{b:03d}" for a, b in spans)
 
 
 _REFERENCE, _VALIDATION = "record.outcome.random_reference", "record.outcome.val_scores"

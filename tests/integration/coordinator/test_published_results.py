@@ -169,7 +169,7 @@ def test_untouched_results_hold(results: Results) -> None:
     checked = rules.check(Held(results.files), results.summary["signer"])
     assert [each for each in checked.findings if each.state == "failed"] == []
     assert {each.kind for each in checked.findings if each.state == "open"} == {"claims", "order", "policies"}
-    assert {each.kind for each in checked.findings} == KINDS.keys() - {"replay", "signals", "logs"}
+    assert {each.kind for each in checked.findings} == KINDS.keys() - {"replay", "logs"}
     assert [each.state for each in checked.listing] == ["published", "published"]
 
 
@@ -402,6 +402,3 @@ def test_logs_are_published_only_on_request_and_without_what_the_search_finds(re
     done = evopolicy(results.root, "check", "logs.evp", "--json", code=0)
     findings = json.loads(done.stdout)["findings"]
     assert [each["state"] for each in findings if each["kind"] == "logs"] == ["open"]
-    signals = [each for each in findings if each["kind"] == "signals"]
-    assert {each["state"] for each in signals} == {"open"}
-    assert any("names the host example.org" in each["text"] for each in signals)
