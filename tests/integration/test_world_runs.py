@@ -1,5 +1,11 @@
 """A whole run in a world: neither its key nor a parameter reaches anything that the agent or the operator
-can read, and the run can be verified."""
+can read, and the run can be verified.
+
+Attacks, each with its defence:
+- looks for the rules of a world before it plays: they follow from a key in the options of its cases, which no
+  gateway, run folder, or log gets; spaces and texts are equal for all keys, and the journal of candidates has
+  neither key nor rules.
+"""
 
 from __future__ import annotations
 

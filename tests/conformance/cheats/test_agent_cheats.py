@@ -76,6 +76,9 @@ def test_nothing_of_the_jail_reaches_a_port_of_this_machine(
 
 
 def test_nothing_left_in_a_closed_run_is_for_other_users(jailed: CheatingRun, unjailed: CheatingRun) -> None:
+    """Attack: leaves access control lists, capabilities, folders that all may write, files of other
+    owners, sockets, pipes. Defence: extended attributes cannot be set; closing the run takes all of
+    these away."""
     for folder in (jailed.folder, unjailed.folder):
         assert stat.S_IMODE(folder.stat().st_mode) == 0o700
         left = [folder, *(path for path in folder.rglob("*") if not path.is_symlink())]

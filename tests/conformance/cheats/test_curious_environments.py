@@ -1,5 +1,10 @@
 """A user's environment sees its own modules and declared data of the folder in which it lies, and info brings no other
-text."""
+text.
+
+Attacks, each with its defence:
+- lies in a folder with runs, keys, `.env`, state (`PYTHONPATH=$PWD`), and reads them: only modules, packages
+  and declared data of such folders are shown, without dot files, keys, run directories, state folders.
+"""
 
 from __future__ import annotations
 
@@ -107,6 +112,9 @@ def test_an_error_names_the_file_that_is_not_shown_and_the_remedy(
 def test_text_in_info_is_passed_on_where_the_definition_declares_its_key(
     tier: Tier, slots: Slots, project: Path
 ) -> None:
+    """Attack: passes texts of this machine on to agents in `info`. Defence: feedback has texts only under
+    keys that the definition declares (`info_strings`, part of its digest). Numbers and observations can
+    still carry anything that the environment sees."""
     description, info = played(slots, tier, entries(project))
     assert info == {"near": 1.0, "steps": 1}
     assert set(description.info_left_out) == {"where", "phase"}

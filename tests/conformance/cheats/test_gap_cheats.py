@@ -1,4 +1,11 @@
-"""A policy that guesses its split from the time between its calls guesses no better than chance."""
+"""A policy that guesses its split from the time between its calls guesses no better than chance.
+
+Attacks, each with its defence:
+- measures the time between its calls, to tell hidden from train episodes: the same work between calls in
+  every split: each step is recorded as feedback has it, and hidden episodes discard it; with policy scope
+  `submit`, as much is sent between two episodes; pictures are compressed after the episode, up to 32 MiB;
+  videos are made after the job's last policy.
+"""
 
 from __future__ import annotations
 

@@ -1,6 +1,10 @@
 """Every type of message that may reach a gateway, field by field: a field that is not listed here fails the test.
 
 Who adds one says here, in words, that an agent may know it.
+
+Attacks, each with its defence:
+- searches its messages, memory, logs, and workspace for a hidden seed, case, or return: no message to a
+  gateway has a field for one.
 """
 
 from __future__ import annotations

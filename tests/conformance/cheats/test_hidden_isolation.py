@@ -157,6 +157,9 @@ def test_without_the_rule_an_agent_hears_its_own_hidden_cases(shared: GoldenClus
 def test_no_hidden_case_is_played_beside_an_agent_that_listens(
     isolated: GoldenCluster,
 ) -> None:
+    """Attack: signals hidden cases through machine-wide counters to an agent on the machine, its own or a
+    sibling run's. Defence: no hidden episode is leased on a kernel on which an agent of a related run
+    may be alive."""
     with listening(isolated, "own", 1) as run:
         run.listens()
         time.sleep(QUIET_S)
@@ -188,6 +191,9 @@ def test_without_the_rule_a_sibling_hears_what_another_run_is_scored_on(shared: 
 
 
 def test_a_run_is_scored_only_after_its_sibling_is_gone(isolated: GoldenCluster) -> None:
+    """Attack: signals hidden cases through machine-wide counters to an agent on the machine, its own or a
+    sibling run's. Defence: no hidden episode is leased on a kernel on which an agent of a related run
+    may be alive."""
     with listening(isolated, "sibling", 1) as sibling:
         sibling.listens()
         with listening(isolated, "scored", 1) as scored:

@@ -1,4 +1,16 @@
-"""A simulator is other people's code: what one finds that takes whatever it can reach from an environment process."""
+"""A simulator is other people's code: what one finds that takes whatever it can reach from an environment process.
+
+Attacks, each with its defence:
+- reads the supervisor's variables, memory, files or limits: a process namespace of its own; Landlock and the
+  filter.
+- signals or traces the supervisor: its process namespace; Landlock and the filter.
+- connects to the coordinator's socket, to a port or an abstract socket of this machine: a network of its own;
+  the filter.
+- plants code in site-packages, the standard library, our code, or itself; leaves files in `/dev/shm` or
+  `/tmp`: read-only mounts; private folders.
+- reads the login's keyring, makes a namespace, mounts: the filter.
+- forks, and lets the fork continue with the pipes of its process: a fork that returns from a call is ended.
+"""
 
 from __future__ import annotations
 
@@ -121,6 +133,8 @@ def attempts(slots: Slots, tier: Tier) -> dict[str, str]:
 
 @pytest.mark.parametrize("tier", ["bwrap", "landlock"])
 def test_a_hostile_simulator_gets_nothing(tier: Tier, slots: Slots, targets: dict[str, Any]) -> None:
+    """Attack: reads the worker's credentials, the state folder, the home folder, other slots' scratch
+    folders or bundles, itself or by a program that it starts. Defence: not in its file system."""
     found = attempts(slots, tier)
     reached = {name: what for name, what in found.items() if what.startswith("got") and name not in ALLOWED}
     assert reached == {}
@@ -141,6 +155,7 @@ def test_without_a_jail_the_same_simulator_gets_it_all(slots: Slots, targets: di
 def test_a_simulator_that_prints_or_sends_out_of_turn_ends_its_slot(
     tier: Tier, slots: Slots, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """Attack: sends garbage in place of the environment process. Defence: the slot is restarted."""
     package = tmp_path / "simulators" / "minigrid"
     package.mkdir(parents=True)
     monkeypatch.setenv("PYTHONPATH", str(package.parent))

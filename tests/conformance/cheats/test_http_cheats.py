@@ -94,6 +94,8 @@ async def serving(tmp_path: Path, listener: Listener | None = None) -> AsyncIter
 
 
 async def test_no_trick_with_a_path_reaches_a_file_or_another_answer(tmp_path: Path) -> None:
+    """Attack: manipulates paths, hosts, or file names in a URL. Defence: a path is a secret token and one
+    of three names, compared as a whole; anything else gets the same 404."""
     async with serving(tmp_path) as w:
         nothing = await w.ask(f"{w.path}/nothing")
         assert status(nothing) == 404
@@ -128,6 +130,7 @@ async def test_no_trick_with_a_path_reaches_a_file_or_another_answer(tmp_path: P
 
 
 async def test_a_submit_that_is_guessed_is_one_of_its_own_or_none(tmp_path: Path) -> None:
+    """Attack: asks for the submits of other runs. Defence: names are looked up among its own."""
     async with serving(tmp_path) as w:
         await w.submit_honestly(0)
         own = await w.ask(f"{w.path}/submit/submit_000")
@@ -159,6 +162,8 @@ async def test_a_submit_that_is_guessed_is_one_of_its_own_or_none(tmp_path: Path
 
 
 async def test_a_request_inside_another_body_is_served_only_with_the_token(tmp_path: Path) -> None:
+    """Attack: smuggles a request in another's body, sends two lengths. Defence: refused or disconnected;
+    each request needs the secret path and its bearer token."""
     async with serving(tmp_path) as w:
         head = f"POST {w.path}/submit HTTP/1.1\r\nHost: {w.host}\r\n"
         inner = f"{head}Content-Length: {len(BODY)}\r\nConnection: close\r\n\r\n".encode() + BODY
@@ -196,6 +201,8 @@ async def test_a_request_inside_another_body_is_served_only_with_the_token(tmp_p
 
 
 async def test_a_smuggled_request_needs_the_bearer_token_again(tmp_path: Path) -> None:
+    """Attack: smuggles a request in another's body, sends two lengths. Defence: refused or disconnected;
+    each request needs the secret path and its bearer token."""
     async with serving(tmp_path, Listener(host="127.0.0.2", port=0)) as w:
         bearer = w.served.folder.bearer.read_text().strip()
         request = f"GET {w.path}/info HTTP/1.1\r\nHost: {w.host}\r\n"
@@ -207,6 +214,8 @@ async def test_a_smuggled_request_needs_the_bearer_token_again(tmp_path: Path) -
 
 
 async def test_a_huge_query_and_odd_headers_change_nothing(tmp_path: Path) -> None:
+    """Attack: sends huge queries, headers or bodies, or sends and reads slowly. Defence: limits, and a
+    clock on every part of a request."""
     async with serving(tmp_path) as w:
         assert status(await w.ask(f"{w.path}/info?{'a=b&' * 7000}")) == 200
         for size in (200_000, 1 << 20):
@@ -242,6 +251,8 @@ async def test_requests_that_cannot_be_read_fill_no_log(
 
 
 async def test_one_request_with_two_keys_is_one_submit(tmp_path: Path) -> None:
+    """Attack: sends a submit twice to be charged once and played twice. Defence: one submit per key and
+    bundle digest, in gateway and coordinator."""
     async with serving(tmp_path) as w:
         head = f"Idempotency-Key: one\r\nIdempotency-Key: two\r\nContent-Length: {len(BODY)}\r\n"
         first = await w.ask(f"{w.path}/submit", "POST", head, BODY)
@@ -254,6 +265,7 @@ async def test_one_request_with_two_keys_is_one_submit(tmp_path: Path) -> None:
 async def test_a_fault_of_ours_is_reported_without_a_word_of_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """Attack: provokes errors that reveal the machine. Defence: fixed texts; system errors go to the log."""
     async with serving(tmp_path) as w:
 
         async def fail() -> None:
@@ -272,6 +284,7 @@ async def test_a_fault_of_ours_is_reported_without_a_word_of_it(
 async def test_feedback_that_cannot_be_written_is_reported_without_the_machines_paths(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """Attack: provokes errors that reveal the machine. Defence: fixed texts; system errors go to the log."""
     monkeypatch.setattr(submits, "DISK_PAUSE_S", 0.1)
 
     def refuse(tree: SubmitTree) -> None:

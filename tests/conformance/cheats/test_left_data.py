@@ -1,6 +1,10 @@
 """A policy that leaves data for its agent outside the protocol, or for its own next episode: nobody finds any of it.
 
 What it prints in train episodes is in the feedback, as the protocol has it: that is how these tests know what it tried.
+
+Attacks, each with its defence:
+- leaves files, names, or sockets for its agent: its own file system, network, and process namespace, deleted
+  after the episode.
 """
 
 from __future__ import annotations
@@ -40,6 +44,8 @@ def test_the_policy_left_something_in_every_train_episode(left: Left) -> None:
 
 
 def test_its_next_episode_finds_nothing(left: Left) -> None:
+    """Attack: leaves something for its own next episode. Defence: a file system that is deleted after the
+    episode; a new process for each episode."""
     assert [report["before"] for report in left.report["reports"]] == [[]] * N_TRAIN
 
 
@@ -50,6 +56,8 @@ def test_its_agent_finds_nothing_and_is_not_called(left: Left) -> None:
 
 
 def test_what_it_says_in_hidden_episodes_is_kept_nowhere_in_the_run(left: Left) -> None:
+    """Attack: prints in hidden episodes. Defence: hidden episodes record actions and rewards only, and
+    nothing leaves before the run is over."""
     marks = {report["mark"].encode() for report in left.report["reports"]}
     assert len(marks) == N_TRAIN
     for path in left.folder.rglob("*"):

@@ -1,5 +1,11 @@
 """What an agent leaves in its workspace does not keep its run from being scored, nor lead anybody astray who reads
-it."""
+it.
+
+Attacks, each with its defence:
+- leaves objects in its workspace that disturb scoring, reports, or comparisons: a pipe in place of `system/`,
+  links to other folders, deeply nested folders, a run directory, removed permissions: file types are checked
+  before opening; links are not followed; depth and size are bounded; permissions are restored.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,11 @@
-"""An agent that swaps what is snapshot, while it is: no submit ever holds what the agent could not read itself."""
+"""An agent that swaps what is snapshot, while it is: no submit ever holds what the agent could not read itself.
+
+Attacks, each with its defence:
+- swaps `system/`, its folders or files for links, pipes or hard links while a submit is taken, also to what
+  only the gateway could read: every path component is opened without following links; only regular files with
+  one name are read; the submit is charged, and the agent learns the offending path.
+- fills `system/` with empty folders, huge or sparse files: counted and limited before they are read.
+"""
 
 from __future__ import annotations
 

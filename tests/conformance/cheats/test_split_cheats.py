@@ -2,6 +2,10 @@
 
 The policy tells what it sees through its actions, which is all that is kept of a hidden episode: 24 bits of a hash of
 each fact. The operator reads them from the coordinator once the run is over.
+
+Attacks, each with its defence:
+- behaves differently during validation: it cannot distinguish splits: forty observable properties are equal
+  in every split, or new in each episode.
 """
 
 from __future__ import annotations

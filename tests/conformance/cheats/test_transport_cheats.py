@@ -65,11 +65,14 @@ def eavesdropped(cheated: Cheated) -> Eavesdropped:
 def test_an_agent_with_a_session_hears_no_other_runs_or_workers(
     eavesdropped: Eavesdropped,
 ) -> None:
+    """Attack: opens its own Zenoh session and listens to everything. Defence: access rules: no subscriber,
+    queryable, or token of a gateway takes effect; the admin space does not answer."""
     assert eavesdropped.report["connected"]
     assert eavesdropped.report["heard"] == []
 
 
 def test_its_session_is_answered_on_its_own_runs_keys_alone(eavesdropped: Eavesdropped) -> None:
+    """Attack: sends requests as a worker or operator, replies as the coordinator. Defence: access rules of Zenoh."""
     answers = eavesdropped.report["answers"]
     # Without this one the others would prove nothing.
     assert answers.pop("own state") == "state_reply"
@@ -111,6 +114,8 @@ async def two_runs(
 async def test_a_captured_submit_that_is_sent_again_is_charged_and_played_once(
     coordinator: Coordinator,
 ) -> None:
+    """Attack: replays another run's captured submit, on either key. Defence: a message is accepted on its
+    own run's key only, and once."""
     async with (
         two_runs(coordinator, "captured") as (owner, thief, client),
         working(coordinator, "w-1") as w,
@@ -150,6 +155,8 @@ async def test_a_captured_submit_that_is_sent_again_is_charged_and_played_once(
 async def test_a_reused_key_with_another_bundle_is_refused(
     coordinator: Coordinator,
 ) -> None:
+    """Attack: sends a submit twice to be charged once and played twice. Defence: one submit per key and
+    bundle digest, in gateway and coordinator."""
     async with two_runs(coordinator, "switched") as (owner, _, client), working(coordinator, "w-2") as w:
         weak, strong = bundle_of("# weak"), bundle_of("# strong")
         first = await owner.submit(weak, (0,), "key")
@@ -171,6 +178,9 @@ async def test_a_reused_key_with_another_bundle_is_refused(
 async def test_another_runs_bundle_cannot_be_played_or_found_by_digest(
     coordinator: Coordinator,
 ) -> None:
+    """Attack: submits a rival's policy by a digest printed in a report; probes whether a bundle or hidden
+    recording is stored. Defence: a run submits only bundles that it uploaded itself; answers do not
+    depend on stored blobs."""
     async with (
         two_runs(coordinator, "stolen") as (owner, thief, client),
         working(coordinator, "w-5") as w,
@@ -199,6 +209,8 @@ async def test_another_runs_bundle_cannot_be_played_or_found_by_digest(
 
 
 async def test_the_same_key_sent_ten_times_at_once_is_one_submit(coordinator: Coordinator) -> None:
+    """Attack: sends a submit twice to be charged once and played twice. Defence: one submit per key and
+    bundle digest, in gateway and coordinator."""
     async with two_runs(coordinator, "at once") as (owner, _, client), working(coordinator, "w-3"):
         bundle = bundle_of("# at once")
         await owner.ask.upload(owner.run, owner.token, bundle.digest, bundle.packed)
@@ -214,6 +226,8 @@ async def test_the_same_key_sent_ten_times_at_once_is_one_submit(coordinator: Co
 async def test_a_submit_while_the_run_is_scored_is_refused_and_changes_nothing(
     coordinator: Coordinator,
 ) -> None:
+    """Attack: submits while the run is scored. Defence: a closed run accepts none; the answer says only
+    that it is closed."""
     async with two_runs(coordinator, "late") as (owner, _, client):
         honest, late = bundle_of("# honest"), bundle_of("# late")
         async with working(coordinator, "w-4") as w:

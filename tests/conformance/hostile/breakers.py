@@ -2,6 +2,11 @@
 
 Three ways in which one is seen to succeed undefended: under a higher limit, in a process that is not sealed, or in the
 environment's own process (`undefended.py`).
+
+Attacks, each with its defence:
+- returns an array of zero bytes that becomes four billion lists, or large actions in every step, to overload
+  the gateway: both sides bound the axes, numbers, and empty lists of an action, and an episode's total beyond
+  the action space.
 """
 
 from __future__ import annotations

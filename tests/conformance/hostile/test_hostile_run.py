@@ -90,6 +90,9 @@ def test_the_worker_plays_an_honest_policy_after_all_of_them_as_before(run: Path
 
 
 def test_no_attack_was_taken_for_a_failure_of_ours(run: Path) -> None:
+    """Attack: ends itself, its sandbox, or its environment after bad luck, to be played again. Defence:
+    every end that it can cause is its result; after a restart, the actions that it returned remain
+    valid (table in `docs/explanation/hostile-policies.md`)."""
     outcome = json.loads((run / "run.json").read_text())["outcome"]
     assert outcome["status"] == "completed"
     assert outcome["quarantined_submits"] == []

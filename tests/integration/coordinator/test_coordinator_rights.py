@@ -96,6 +96,8 @@ async def test_wrong_operator_token_is_refused(coordinator: Coordinator) -> None
 
 
 async def test_gateway_of_one_run_can_do_nothing_with_another(coordinator: Coordinator) -> None:
+    """Attack: uses another run's capability, guesses one, names another run. Defence: a capability is
+    valid for one run; a wrong capability and an unknown run get the same answer."""
     async with operator_of(coordinator) as client:
         mine, other = await client.create("mine"), await client.create("other")
         async with gateway_of(coordinator, mine) as intruder:
@@ -117,6 +119,8 @@ async def test_gateway_of_one_run_can_do_nothing_with_another(coordinator: Coord
 
 
 async def test_unknown_run_is_answered_like_a_wrong_capability(coordinator: Coordinator) -> None:
+    """Attack: uses another run's capability, guesses one, names another run. Defence: a capability is
+    valid for one run; a wrong capability and an unknown run get the same answer."""
     async with connect(coordinator.credentials("gateway")) as link:
         with pytest.raises(RefusedError) as unknown:
             await GatewayClient(link, "r-nowhere", "guess").open()
@@ -177,6 +181,7 @@ def test_wrong_password_is_not_let_in(coordinator: Coordinator) -> None:
 async def test_gateway_fetches_blobs_that_its_own_train_feedback_names_and_no_others(
     coordinator: Coordinator,
 ) -> None:
+    """Attack: fetches blobs that are not of its train feedback. Defence: refused like unknown ones."""
     stored: dict[str, bytes] = {}
 
     def play_with_blob(job: Job, spec: EpisodeSpec) -> EpisodeOutcome:

@@ -1,5 +1,10 @@
 """Each field of each published file, changed and signed again by its own publisher: refused, contradicted, or listed as
-a claim."""
+a claim.
+
+Attacks, each with its defence:
+- any other edit of a field, files or fields added, keys that occur twice, by the publisher with the own key:
+  refused, contradicted, or listed as a claim that nobody can check.
+"""
 
 from __future__ import annotations
 

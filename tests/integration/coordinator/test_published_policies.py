@@ -1,4 +1,9 @@
-"""`evopolicy check --policies`: policies that declare themselves deterministic are played again; others are not."""
+"""`evopolicy check --policies`: policies that declare themselves deterministic are played again; others are not.
+
+Attacks, each with its defence:
+- actions that the policy did not choose: `--policies` finds them if the policy declares itself deterministic;
+  otherwise nothing does.
+"""
 
 from __future__ import annotations
 

@@ -2,6 +2,14 @@
 
 Most forgers here are strong: they make all digests, the journal's head and the signature anew, with a key of their own.
 They cannot make anew a field that follows from another one.
+
+Attacks, each with its defence:
+- NaN, huge numbers, text that is not UTF-8, endless nesting, later versions: refused with the file's name.
+- changed returns, swapped policies, dropped runs and episodes, edited settings, other splits, reordered
+  submits, a cut or edited journal, another signer: the check reports each, even if digests and signature are
+  recomputed with another key.
+- rewards that the environment does not give, with a new journal that matches them: only `--replay` and
+  `--identity` find it.
 """
 
 from __future__ import annotations
@@ -175,6 +183,9 @@ def test_untouched_results_hold(results: Results) -> None:
 
 @pytest.mark.parametrize("kind", SIGNED_ANEW)
 def test_tampering_is_named_though_all_is_signed_anew(results: Results, kind: str) -> None:
+    """Attack: opens a run as a replay, to get another run's hidden cases and random seeds, or to hide a
+    run from the count of runs. Defence: only the operator with the run's key, after the run's end, with
+    the same settings; marked in the journal, and never published or in a report."""
     edit, finding, text = SIGNED_ANEW[kind]
     forger = Forger(results.files)
     edit(forger)
@@ -250,6 +261,8 @@ def test_publishing_again_gives_the_same_bytes(results: Results) -> None:
 
 
 def test_nothing_of_this_machine_is_in_what_is_published(results: Results) -> None:
+    """Attack: secrets, paths, and names of the publishing machine in what is published. Defence: removed,
+    and searched for."""
     identity = json.loads((results.root / "st" / "identity.json").read_bytes())
     secrets = [*identity["passwords"].values(), identity["worker_token"], identity["operator_token"]]
     everything = b"".join(results.files.values())
@@ -297,6 +310,8 @@ def invented(results: Results) -> str:
 
 @pytest.mark.parametrize("share", ["all", "1%"])
 def test_a_replay_without_held_out_recordings_is_never_ok(results: Results, share: str) -> None:
+    """Attack: invented returns without the recordings that would contradict them. Defence: `--replay` ends
+    with exit code 3 and names the episodes without a recording; a leaderboard shows the run apart."""
     done = evopolicy(results.root, "check", invented(results), "--replay", share, code=3)
     assert "open   recordings: only 0 of 3 held-out episodes have a recording" in done.stdout
     assert "1 of 2 runs have episodes without a recording" in done.stdout
@@ -380,6 +395,8 @@ def test_a_hundred_thousand_entries_are_checked_in_seconds(results: Results) -> 
 
 
 def test_logs_are_published_only_on_request_and_without_what_the_search_finds(results: Results) -> None:
+    """Attack: secrets in an agent's log that is published with `--with-logs`. Defence: replaced, and
+    searched for again."""
     folder = results.root / results.run_folder("first")
     log = folder / "logs" / "agent.jsonl"
     before = log.read_bytes() if log.exists() else b""

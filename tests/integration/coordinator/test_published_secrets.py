@@ -1,4 +1,10 @@
-"""Keys of a run's command line and variables: what is recorded and published of them."""
+"""Keys of a run's command line and variables: what is recorded and published of them.
+
+Attacks, each with its defence:
+- a key that the agent got is in a policy or recording that is published: its look, or a keyed digest of it,
+  is searched for; a match stops the publication before cases are disclosed, unless its file is left out or
+  its line accepted.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,9 @@
-"""An episode or submit over which gateways die is put aside with an error, and the run goes on."""
+"""An episode or submit over which gateways die is put aside with an error, and the run goes on.
+
+Attacks, each with its defence:
+- crashes the gateway repeatedly with one episode's files: an episode that crashed two gateways is set aside
+  with an error.
+"""
 
 from __future__ import annotations
 

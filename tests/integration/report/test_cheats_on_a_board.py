@@ -1,4 +1,9 @@
-"""Two boards of six entries from two labs that cheat: each row of the table in docs/how-to/publish.md."""
+"""Two boards of six entries from two labs that cheat: each row of the table in docs/how-to/publish.md.
+
+Attacks, each with its defence:
+- the cheats of six entries from two labs, found or not: each appears as [the page on publication](docs/how-
+  to/publish.md#findings-for-each-cheat) says.
+"""
 
 from __future__ import annotations
 

@@ -1,5 +1,10 @@
 """The two labs of docs/how-to/leaderboard.md: the page's own commands, a clean installation, and the site in
-Chromium."""
+Chromium.
+
+Attacks, each with its defence:
+- a changed, truncated, or repeated file, or names with markup, in a leaderboard: the file is listed
+  separately with the reason; markup appears as text.
+"""
 
 from __future__ import annotations
 

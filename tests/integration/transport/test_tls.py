@@ -1,4 +1,9 @@
-"""Who gets in over TLS, and how far: real sessions with wrong certificates beside an honest worker that is served."""
+"""Who gets in over TLS, and how far: real sessions with wrong certificates beside an honest worker that is served.
+
+Attacks, each with its defence:
+- uses another worker's password, or that of the coordinator's local workers: a user has rights with its own
+  certificate only; local passwords are unknown at the TLS listener.
+"""
 
 from __future__ import annotations
 
@@ -79,6 +84,8 @@ def with_certificate_of(credentials: Credentials, other: Credentials) -> Credent
 async def test_a_machine_is_answered_on_the_keys_of_its_role_only(
     certs: OwnCerts, name: str, role: Role
 ) -> None:
+    """Attack: combines a gateway's certificate with a worker's user. Defence: a user has rights with its
+    own certificate only."""
     async with (
         coordinator(certs) as asked,
         transport.connect(of(folder(certs, name), role), timeout_s=30) as link,
@@ -110,6 +117,8 @@ def refused_clients(certs: OwnCerts, tmp_path: Path) -> dict[str, Credentials]:
 async def test_who_has_no_good_certificate_and_password_gets_no_session(
     certs: OwnCerts, tmp_path: Path
 ) -> None:
+    """Attack: shows a certificate of another authority, or one that has expired. Defence: the TLS handshake; an
+    open link ends when its certificate does."""
     async with (
         coordinator(certs) as asked,
         transport.connect(of(folder(certs, "worker-honest"))) as honest,
@@ -122,6 +131,7 @@ async def test_who_has_no_good_certificate_and_password_gets_no_session(
 
 @pytest.mark.parametrize("plain", [True, False], ids=["tcp", "tls"])
 async def test_who_shows_no_certificate_gets_no_session(certs: OwnCerts, plain: bool) -> None:
+    """Attack: connects without a certificate or without TLS. Defence: the TLS handshake."""
     honest = of(folder(certs, "worker-honest"))
     assert honest.tls is not None
     config = zenoh.Config()
@@ -166,6 +176,8 @@ async def test_a_user_with_another_machines_certificate_is_answered_nothing(
 
 
 async def test_a_machines_certificate_cannot_stand_in_for_the_coordinators(certs: OwnCerts) -> None:
+    """Attack: impersonates the coordinator with a worker's certificate, or one for another host. Defence:
+    machine certificates are not valid for servers; the dialled name must be in the certificate."""
     honest, other = of(folder(certs, "worker-honest")), of(folder(certs, "worker-other"))
     assert other.tls is not None
     passwords, admitted = Machines(certs.state).passwords, [("worker", "worker/honest")]
@@ -181,6 +193,8 @@ async def test_a_machines_certificate_cannot_stand_in_for_the_coordinators(certs
 
 
 async def test_a_coordinator_that_is_not_named_in_its_certificate_is_not_trusted(tmp_path: Path) -> None:
+    """Attack: impersonates the coordinator with a worker's certificate, or one for another host. Defence:
+    machine certificates are not valid for servers; the dialled name must be in the certificate."""
     elsewhere = OwnCerts(tmp_path / "c", hosts=("coordinator.lab", "10.1.2.3"))
     honest = of(elsewhere.issue("worker", "honest"))
     async with coordinator(elsewhere) as asked:
@@ -189,6 +203,8 @@ async def test_a_coordinator_that_is_not_named_in_its_certificate_is_not_trusted
 
 
 async def test_a_machine_is_admitted_and_revoked_while_the_coordinator_listens(tmp_path: Path) -> None:
+    """Attack: presents a revoked certificate, on a new or open link. Defence: its user and name are
+    removed; all links are closed, and only admitted machines can reconnect."""
     certs = OwnCerts(tmp_path / "c")
     honest = of(certs.issue("worker", "honest"))
     async with coordinator(certs) as asked, transport.connect(honest) as link:
@@ -227,6 +243,8 @@ async def test_the_last_revoked_machine_is_refused_without_a_user_too(tmp_path: 
 
 
 async def test_a_folder_that_was_issued_again_voids_the_one_before(tmp_path: Path) -> None:
+    """Attack: uses a folder that has since been replaced (`--renew`). Defence: password, token and session
+    are invalid."""
     certs = OwnCerts(tmp_path / "c")
     before = of(certs.issue("worker", "w"))
     kept = tmp_path / "kept"
@@ -242,6 +260,8 @@ async def test_a_folder_that_was_issued_again_voids_the_one_before(tmp_path: Pat
 
 
 async def test_an_open_link_ends_with_its_certificate(tmp_path: Path) -> None:
+    """Attack: shows a certificate of another authority, or one that has expired. Defence: the TLS handshake; an
+    open link ends when its certificate does."""
     certs = OwnCerts(tmp_path / "c")
     honest = of(certs.issue("worker", "honest"))
     async with coordinator(certs), transport.connect(honest, timeout_s=30) as link:

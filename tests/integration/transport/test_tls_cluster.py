@@ -1,4 +1,9 @@
-"""A coordinator's process and machines that reach it over TLS: a run through it, and a machine revoked in its midst."""
+"""A coordinator's process and machines that reach it over TLS: a run through it, and a machine revoked in its midst.
+
+Attacks, each with its defence:
+- makes a command send its token over plain `tcp/` beyond loopback: refused by the coordinator and by every
+  command.
+"""
 
 from __future__ import annotations
 
@@ -100,6 +105,9 @@ async def refusal(answer: Awaitable[object]) -> str:
 async def test_a_revoked_worker_loses_its_leases_to_an_honest_one(
     certs: OwnCerts, coordinator: Coordinator
 ) -> None:
+    """Attack: uses a revoked machine's token or session on another path (a router, a socket of the
+    coordinator's machine). Defence: every request is refused, its results are rejected, and its leases
+    are played by others."""
     boss = certs.issue("operator", "boss")
     honest, cheat = certs.issue("worker", "honest"), certs.issue("worker", "cheat")
     async with operators(boss) as operator, joined(cheat, "cheat", slots=2) as revoked:
@@ -128,6 +136,9 @@ async def test_a_revoked_worker_loses_its_leases_to_an_honest_one(
 
 
 async def test_a_revoked_operator_asks_for_nothing_more(certs: OwnCerts, coordinator: Coordinator) -> None:
+    """Attack: uses a revoked machine's token or session on another path (a router, a socket of the
+    coordinator's machine). Defence: every request is refused, its results are rejected, and its leases
+    are played by others."""
     boss = certs.issue("operator", "boss")
     async with operators(boss) as operator:
         await operator.status()

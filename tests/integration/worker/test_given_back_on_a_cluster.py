@@ -4,6 +4,10 @@ once.
 A real coordinator, a real supervisor and its real slot; the agent is on another machine, so that its submits may be
 played. The environment is the test's own: a hidden episode of it goes on until the test writes its length to a file,
 however slow the machine is.
+
+Attacks, each with its defence:
+- uses its agent's submits to pre-empt its validation and get a second attempt: the stopped episode returns
+  the policy's actions and failure; the next attempt plays them first and waits until they have arrived.
 """
 
 from __future__ import annotations

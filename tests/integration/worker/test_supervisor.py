@@ -358,6 +358,8 @@ def test_a_drained_worker_hands_back_what_it_has_not_played(coordinator: Coordin
 async def test_a_submit_of_128_talkative_episodes_is_handed_in_and_blocks_nothing(
     coordinator: Coordinator, tmp_path: Path
 ) -> None:
+    """Attack: prints so much that the worker's results exceed a message. Defence: large outcomes are sent
+    as blobs; a result that is refused for good is settled and blocks nothing."""
     async with supervising(coordinator, tmp_path, dress=talkative), operator_of(coordinator) as operator:
         created = await operator.create(policy_scope="submit", budget=128, n_validation=2, n_heldout=2)
         async with gateway_of(coordinator, created) as gateway:
@@ -526,6 +528,8 @@ async def test_a_silent_coordinator_stops_hidden_episodes_only(
 async def test_a_waiting_submit_stops_hidden_episodes_that_would_never_end(
     coordinator: Coordinator, tmp_path: Path
 ) -> None:
+    """Attack: sleeps or crashes on hidden cases to make its agent's submits wait or fail. Defence: train
+    jobs pre-empt hidden ones; outcomes of hidden jobs stay secret until the end."""
     hanging = asyncio.Event()
     stopped: list[str] = []
     go_on = asyncio.Event()

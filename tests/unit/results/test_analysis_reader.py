@@ -1,4 +1,9 @@
-"""Run directories in: what is read, and what is left out with which reason."""
+"""Run directories in: what is read, and what is left out with which reason.
+
+Attacks, each with its defence:
+- a `run.json` that names folders of the reader's machine as its workspace, logs or checkpoints: a leaderboard
+  drops the names; `report` leaves out a run directory that names folders outside itself.
+"""
 
 from __future__ import annotations
 

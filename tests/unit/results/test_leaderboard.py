@@ -48,6 +48,9 @@ def test_entries_of_several_signers_get_their_names(tmp_path: Path) -> None:
 
 
 def test_files_of_one_signer_whose_journals_contradict_each_other_are_reported(tmp_path: Path) -> None:
+    """Attack: two files of one signer from journals of which neither continues the other, in a
+    leaderboard. Defence: the check `order` fails for both; their runs are shown, since nothing tells
+    which one is true."""
     bundles = [bundle(tmp_path / str(n), signer, "", "evolve") for n, signer in enumerate((A, A, A, A, B))]
     lines = [b"first", b"second", b"third"]
     anew = [b"first", b"third"]
@@ -62,6 +65,8 @@ def test_files_of_one_signer_whose_journals_contradict_each_other_are_reported(t
 
 
 def test_no_signer_gets_into_the_entry_of_another(tmp_path: Path) -> None:
+    """Attack: an entry under the name of another signer's entry in a leaderboard. Defence: names are
+    extended until each entry has one signer."""
     for n, (lab_a, lab_b, theirs) in enumerate(
         [
             ("Lab-A", "", ("evolve", "evolve (Lab-A)")),  # the name that the other's entry gets
@@ -86,6 +91,9 @@ def test_runs_of_one_name_in_two_files_have_own_pages(tmp_path: Path) -> None:
 
 
 def test_an_unpacked_run_names_no_files_of_this_machine(tmp_path: Path) -> None:
+    """Attack: a `run.json` that names folders of the reader's machine as its workspace, logs or
+    checkpoints. Defence: a leaderboard drops the names; `report` leaves out a run directory that names
+    folders outside itself."""
     record = decode_run_record((write_run(tmp_path / "run", VERSIONS) / "run.json").read_bytes())
     hostile = msgspec.structs.replace(
         record, artifacts=Artifacts(workspace="/home", logs_agent="/etc/passwd", checkpoints="../..")

@@ -1,5 +1,11 @@
 """Files of published results come from strangers: whatever the writer would not have made is refused, with the
-reason."""
+reason.
+
+Attacks, each with its defence:
+- zip bombs, links, absolute paths, duplicate names, overlaps, millions of files, huge files: the reader has
+  its own archive parser, and refuses every archive that the writer could not have written before it reads
+  content.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,9 @@
-"""Terms of the publishing machine are matched wherever they stand; names that identify nobody are not."""
+"""Terms of the publishing machine are matched wherever they stand; names that identify nobody are not.
+
+Attacks, each with its defence:
+- secrets in an agent's log that is published with `--with-logs`: replaced, and searched for again.
+- secrets, paths, and names of the publishing machine in what is published: removed, and searched for.
+"""
 
 from __future__ import annotations
 

@@ -3,6 +3,11 @@ unaffected.
 
 No reader waits for a pipe, follows a link to this machine's files, reads a file without end, or raises what no command
 reports.
+
+Attacks, each with its defence:
+- a run directory with links, pipes, devices, files without end, archives or JSON that take gigabytes, damaged
+  values of any kind: refused by every command that reads it, with the file's name, or left out with the
+  reason.
 """
 
 from __future__ import annotations

@@ -2,6 +2,38 @@
 
 Started as `python cheating_agent.py TARGETS`, a JSON object of what there is to attack on this machine: in a real run
 an agent would have to guess it, and what it may guess it may know.
+
+Attacks, each with its defence:
+- edits, extends, or moves `feedback/`: read-only mount over the workspace.
+- edits or replaces `AGENTS.md`: read-only mount of the file.
+- mounts something over them: no capability, no new namespaces.
+- reads the coordinator's state, the operator's or the gateway's credentials: not in its file system; covered
+  in a folder that is bound.
+- reads another run's folder, lists the runs: not in its file system; covered in a folder that is bound.
+- reads the operator's home or variables: a home of its own; a list of variables that pass.
+- inspects other processes, their variables and memory (also its gateway's), or signals them: process
+  namespace.
+- opens a Zenoh session, connects to the coordinator's socket: the socket is not in its file system; passwords
+  and access control behind that.
+- connects to a TCP port or an abstract socket of the machine: network namespace.
+- opens a socket family that namespaces do not separate, or an io_uring that creates sockets: a seccomp
+  filter.
+- requests another host, or another port of an allowed host, from the proxy: exact list of host and port.
+- `pip`, `git`, a datagram to anywhere: no route, no name service.
+- imports or copies a simulator from this machine: not shown, or covered.
+- writes kernel settings as root: `/proc/sys` read-only.
+- reads the operator's session keyring, or leaves a message for another run in one: a session keyring of its
+  own; keyring calls are refused.
+- reads hidden paths from the jail's command line, or acts through an unfiltered process of the jail:
+  bubblewrap reads its arguments from a descriptor, and its first process is filtered too.
+- reads machine-wide kernel counters or the kernel log: an allow-listed `/proc`; `stat`, `loadavg`, and
+  `uptime` are frozen.
+- leaves a set-id program, which runs with the operator's rights for every local user, also root's: the filter
+  refuses set-id bits in every call that gives a file its mode, and calls that it cannot read or does not
+  know; no other user may enter a run's folder; closing the run takes such bits away, also without a jail.
+- leaves access control lists, capabilities, folders that all may write, files of other owners, sockets,
+  pipes: extended attributes cannot be set; closing the run takes all of these away.
+- leaves a child that ignores SIGTERM in its own session: the end of its process namespace.
 """
 
 import ctypes

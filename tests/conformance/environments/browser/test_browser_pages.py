@@ -1,4 +1,18 @@
-"""Pages that attack: each is opened as an environment's page is, and gets nothing of what it wants."""
+"""Pages that attack: each is opened as an environment's page is, and gets nothing of what it wants.
+
+Attacks, each with its defence:
+- reads files by `file://`, `..` or a link: the browser requests each file from the environment process, and only
+  installed programs are in its file system.
+- keeps something for a later episode: storage, cookies, databases, service workers, the window's name, the
+  clipboard: storage lasts in memory for one episode; no secure context; a process whose browser has played a
+  hidden episode plays no train episode.
+- opens windows, blocks with `alert`, or navigates to another page, also through a policy's clicks and keys:
+  one window; dialogs are dismissed; navigation ends the episode; calls such as `goto` are refused.
+- saves files by downloads: downloads are refused.
+- loops for ever, or fills the memory: a time limit for each command and a memory limit for scripts; the
+  browser is replaced, and the episode is replayed up to that step; a browser that has grown is replaced
+  between episodes.
+"""
 
 from __future__ import annotations
 
@@ -83,6 +97,9 @@ def listener() -> Iterator[Listener]:
 def test_a_page_reaches_no_server_even_on_this_machine(
     browser: Page, tmp_path: Path, listener: Listener
 ) -> None:
+    """Attack: requests a server, on this machine or elsewhere, in any way that a page has. Defence: the
+    browser requests each file from the environment process, which serves the package's folder only; no
+    name resolves; the jail has no network."""
     url = f"http://127.0.0.1:{listener.port}"
     script = f"""
       window.got = [];

@@ -48,6 +48,9 @@ def test_a_policy_clicks_in_a_browser_in_its_slot(slots: Slots, tier: Tier) -> N
 
 
 def test_a_browser_that_played_a_hidden_episode_plays_no_train_episode(slots: Slots) -> None:
+    """Attack: keeps something for a later episode: storage, cookies, databases, service workers, the
+    window's name, the clipboard. Defence: storage lasts in memory for one episode; no secure context; a
+    process whose browser has played a hidden episode plays no train episode."""
     slot = slots.new()
     slots.run(slot.start())
 

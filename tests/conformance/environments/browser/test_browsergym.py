@@ -247,6 +247,9 @@ def test_a_drawing_that_the_page_fills_later_is_an_image(warm: Warm) -> None:
     ],
 )
 def test_what_cannot_be_done_is_reported_and_the_episode_goes_on(warm: Warm, action: str, error: str) -> None:
+    """Attack: opens windows, blocks with `alert`, or navigates to another page, also through a policy's
+    clicks and keys. Defence: one window; dialogs are dismissed; navigation ends the episode; calls such
+    as `goto` are refused."""
     environment = warm("browsergym/miniwob.enter-text")
     environment.reset(Case(seed=1))
     step = environment.step(action)

@@ -108,6 +108,9 @@ def test_text_is_typed(warm: Warm, typing: str) -> None:
 
 
 def test_no_later_episode_can_paste_a_copied_text(warm: Warm) -> None:
+    """Attack: keeps something for a later episode: storage, cookies, databases, service workers, the
+    window's name, the clipboard. Defence: storage lasts in memory for one episode; no secure context; a
+    process whose browser has played a hidden episode plays no train episode."""
     environment = warm("miniwob/copy-paste-v1")
 
     def fields(obs: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any], dict[str, Any]]:
@@ -254,6 +257,9 @@ def _played(environment: Environment, lose: Callable[[int], None]) -> list[Step]
 def test_an_episode_survives_the_loss_of_its_browser(
     warm: Warm, how: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """Attack: loops for ever, or fills the memory. Defence: a time limit for each command and a memory
+    limit for scripts; the browser is replaced, and the episode is replayed up to that step; a browser
+    that has grown is replaced between episodes."""
     environment = warm("miniwob/click-checkboxes-v1")
     undisturbed = _played(environment, lambda n: None)
 

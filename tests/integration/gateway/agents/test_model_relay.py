@@ -107,6 +107,8 @@ def test_odd_answers_are_counted_as_they_were_given(tmp_path: Path, operator: Pa
 
 @pytest.mark.parametrize("protocol", ["openai", "anthropic"])
 def test_the_key_is_nowhere_in_the_jail(tmp_path: Path, operator: Path, protocol: str) -> None:
+    """Attack: searches every file and process of its jail for the key. Defence: the key is in the relay
+    alone; an answer that repeats it is changed."""
     base = json.dumps(os.path.realpath(os.sys.base_prefix))  # type: ignore[attr-defined]
     search = f"cat > /tmp/s.py <<'E'\nBASE = {base}\n{SEARCH}\nE\npython3 -P /tmp/s.py; env"
     record, api, _ = played(tmp_path, operator, [Step(command=search), *ENDS], protocol)
@@ -184,6 +186,8 @@ def test_a_cancelled_run_has_all_that_it_used(tmp_path: Path, operator: Path) ->
 
 @pytest.mark.parametrize("victim", ["relay", "supervisor", "command", "everything"])
 def test_a_kill_loses_no_finished_request(tmp_path: Path, operator: Path, victim: str) -> None:
+    """Attack: kills or ends processes so that requests are not counted. Defence: the ledger is written
+    before an answer ends."""
     script = [SUBMIT, *[Step(command="sleep 0.1")] * 12, *ENDS[1:]]
     with ModelApi(script) as api:
         arguments = run_arguments(operator, llm_agent(tmp_path, api.base_url))
@@ -247,6 +251,8 @@ EDIT = Step(command=f"echo '{LUCK}' > system/policy.py; pwd; date; ls -l; cat AG
 def test_a_recorded_agent_replays_to_the_byte_without_its_model(
     tmp_path: Path, operator: Path, protocol: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """Attack: hands over a run directory that names programs, which `evopolicy replay` would run. Defence:
+    `.replay.json` has an authentication code by a key of the user; without it, `--trust` is needed."""
     script = [EDIT, SUBMIT, EDIT, Step(odd=odd_answers.busy(429, retry_after="0")), *ENDS[1:]]
     with ModelApi(script) as api:
         arguments = run_arguments(operator, llm_agent(tmp_path, api.base_url, protocol))

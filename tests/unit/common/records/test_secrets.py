@@ -1,4 +1,9 @@
-"""Looks of keys, command lines without them, and values that a run passed, found by digest."""
+"""Looks of keys, command lines without them, and values that a run passed, found by digest.
+
+Attacks, each with its defence:
+- keys on an agent's command line in `run.json`, logs, and the coordinator's state: replaced where they are
+  recorded; the agent gets them.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,11 @@
-"""The workspace at a submit as a tree: what it takes, what it omits, and what a start gets from it."""
+"""The workspace at a submit as a tree: what it takes, what it omits, and what a start gets from it.
+
+Attacks, each with its defence:
+- floods the record of its workspace, puts links, pipes or keys into it: regular files only, opened without
+  following links; files with keys are left out; files and bytes are bounded, and recording fails no submit.
+- leaves links to hidden results in what a later run starts from: tree and history hold regular files only;
+  the final `workspace/system/` is not read.
+"""
 
 from __future__ import annotations
 

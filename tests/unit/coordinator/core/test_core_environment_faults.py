@@ -1,5 +1,12 @@
 """An environment that keeps ending the same job is given up, and its run ends with an error; nothing waits for it for
-ever."""
+ever.
+
+Attacks, each with its defence:
+- hangs, raises, exits, leaks memory, changes its spaces, gives rewards that are not finite: the call has a
+  time limit and the process a memory limit (`--env-timeout`, `--env-memory`); the process is replaced, the
+  operator gets environment, call, and remedy, and no agent is charged; a run whose episode it ends every time
+  ends with an error after 15 minutes.
+"""
 
 from __future__ import annotations
 
@@ -74,6 +81,8 @@ def test_an_environment_that_fails_now_and_then_is_not_given_up(rig: Rig) -> Non
 
 @pytest.mark.parametrize("machine", ["", "rack-1"])
 def test_one_machine_alone_ends_no_run_that_another_can_play(rig: Rig, machine: str) -> None:
+    """Attack: a worker reports again and again that the environment failed, so that a run ends. Defence: a
+    run ends so only when two machines report it, if two can play it."""
     liars = [rig.register(name, machine=machine and "liar") for name in ("w1", "w2")[: 2 if machine else 1]]
     honest = rig.register("w3", machine=machine)
     rig.create(n_valid=1)

@@ -137,6 +137,8 @@ def found_ineligible(rig: Rig, index: int) -> None:
 
 
 def test_a_checkpoint_found_ineligible_earlier_stays_so_and_only_the_end_tells(rig: Rig) -> None:
+    """Attack: sleeps or crashes on hidden cases to make its agent's submits wait or fail. Defence: train
+    jobs pre-empt hidden ones; outcomes of hidden jobs stay secret until the end."""
     session = rig.begin(0, worker={"slots": 8}, run={"n_valid": 1})
     rig.play(session, *rig.poll(session, 8))
     before = rig.ask(gateway.StateRequest, run="r1")

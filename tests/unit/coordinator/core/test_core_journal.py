@@ -1,4 +1,8 @@
-"""The journal: every run that is opened, what was fixed of it, what became of it, and when its cases became public."""
+"""The journal: every run that is opened, what was fixed of it, what became of it, and when its cases became public.
+
+Attacks, each with its defence:
+- edit a result: its digest is in the entry that ended the run.
+"""
 
 from __future__ import annotations
 
@@ -43,6 +47,8 @@ def finish(rig: Rig, session: str = "", **run: Any) -> None:
 
 
 def test_a_run_is_committed_to_in_the_transaction_that_makes_it(rig: Rig) -> None:
+    """Attack: choose splits or settings after the agent played. Defence: they do not match the commitment
+    in the journal."""
     rig.create(agent=None)
     row = rig.row(RunRow, "r1")
     document = rig.row(DocumentRow, "r1", "opening").data
@@ -64,6 +70,7 @@ def test_what_is_committed_to_tells_nothing_of_the_operators_own(rig: Rig) -> No
 
 @pytest.mark.parametrize("cancelled", [False, True])
 def test_whatever_becomes_of_a_run_its_result_is_fixed(rig: Rig, cancelled: bool) -> None:
+    """Attack: leave out a run that went badly, was cancelled, or was replaced. Defence: its entry stays."""
     session = rig.begin()
     if cancelled:
         rig.ask(operator.CancelRun, run="r1")
@@ -107,6 +114,8 @@ def test_runs_of_an_earlier_version_end_without_an_entry(rig: Rig) -> None:
 
 
 def test_no_cases_are_revealed_while_a_run_of_their_epoch_is_open(rig: Rig) -> None:
+    """Attack: publish the cases of an epoch with a run whose agent is alive. Defence: refused while any
+    run of the epoch is unfinished."""
     session = rig.begin(run={"hidden_from": 0})
     rig.create("r2", hidden_from=5000)
     finish(rig, session)
@@ -119,6 +128,7 @@ def test_no_cases_are_revealed_while_a_run_of_their_epoch_is_open(rig: Rig) -> N
 
 
 def test_no_new_run_gets_a_revealed_epoch_after_a_restart(rig: Rig) -> None:
+    """Attack: play new runs on cases that a publication revealed. Defence: refused, also after a restart."""
     finish(rig)
     disclose(rig, "r1")
     for _ in range(2):

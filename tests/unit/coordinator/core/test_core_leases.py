@@ -344,6 +344,8 @@ def test_a_result_that_outlives_the_coordinator_is_taken() -> None:
 
 
 def test_what_was_never_granted_is_neither_taken_nor_adopted_after_a_restart() -> None:
+    """Attack: after a restart of the coordinator, reports or claims an attempt that it never got. Defence:
+    a lease's name is a keyed hash of job, attempt and worker."""
     rig, _, lease = one_job("w1")
     rig.load()
     thief = rig.register("w2")

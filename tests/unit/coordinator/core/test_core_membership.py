@@ -1,4 +1,9 @@
-"""One token lets only so many workers join, with descriptions of a bounded size."""
+"""One token lets only so many workers join, with descriptions of a bounded size.
+
+Attacks, each with its defence:
+- registers ever more worker names, or large descriptions under each: 4,096 workers and 256 MiB of
+  descriptions for one token.
+"""
 
 from __future__ import annotations
 

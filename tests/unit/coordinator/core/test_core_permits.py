@@ -60,6 +60,8 @@ def test_a_permit_is_durable_and_asked_for_again_at_no_cost(rig: Rig) -> None:
 
 @pytest.mark.parametrize("restart", [False, True])
 def test_nothing_hidden_is_leased_where_a_related_agent_may_be_alive(rig: Rig, restart: bool) -> None:
+    """Attack: listens while its own checkpoints are validated on its machine. Defence: its permit bars its
+    run's hidden cases from that kernel while it may be alive."""
     session = scored(rig)
     rig.create("r1", agent=HERE)
     if restart:
@@ -85,6 +87,8 @@ def test_nothing_hidden_is_leased_where_a_related_agent_may_be_alive(rig: Rig, r
 def test_agents_keep_the_hidden_cases_of_related_runs_from_their_kernels(
     rule: str, agent: dict[str, Any], wanted: set[str]
 ) -> None:
+    """Attack: listens while a sibling run is scored there. Defence: runs that share one hidden case are
+    related."""
     rig = Rig(hidden_isolation=rule)
     session = scored(rig)
     rig.create("r1", **agent)
@@ -125,6 +129,8 @@ def test_a_worker_on_an_unknown_kernel_plays_nothing_hidden(rig: Rig) -> None:
 
 
 def test_a_permit_stops_hidden_jobs_and_waits_for_their_worker(rig: Rig) -> None:
+    """Attack: starts while a hidden episode is being stopped, or while its worker is silent. Defence: the
+    permit is granted only after the worker has released the episode, or has certainly stopped it."""
     session = scored(rig)
     leases = rig.poll(session, 8)
     hidden = [lease for lease in leases if split_of(lease.job) == "validation"]
@@ -164,6 +170,8 @@ def test_a_request_that_is_never_sent_again_is_forgotten(rig: Rig) -> None:
 
 
 def test_a_silent_workers_kernel_stays_barred_until_it_has_surely_stopped(rig: Rig) -> None:
+    """Attack: starts while a hidden episode is being stopped, or while its worker is silent. Defence: the
+    permit is granted only after the worker has released the episode, or has certainly stopped it."""
     played(rig)
     rig.pass_time(20.0)  # the worker is lost, its leases are given up
     assert rig.core.state.workers["w1"].state == "lost"
@@ -232,6 +240,8 @@ def test_a_permit_ends_with_its_run(rig: Rig) -> None:
 def test_a_cancelled_runs_permit_ends_by_its_gateway_or_time(
     rig: Rig, restart: bool, confirmed: bool
 ) -> None:
+    """Attack: stays alive after its gateway was lost or its run cancelled. Defence: the kernel stays
+    barred until the run is closed or the operator vouches; half a minute after a cancellation."""
     session = scored(rig)
     rig.create("r1", agent=HERE)
     rig.ask(operator.CancelRun, run="r1")
@@ -256,6 +266,8 @@ def test_a_cancelled_runs_permit_ends_by_its_gateway_or_time(
 
 
 def test_an_operators_word_ends_a_permit_and_silence_does_not(rig: Rig) -> None:
+    """Attack: stays alive after its gateway was lost or its run cancelled. Defence: the kernel stays
+    barred until the run is closed or the operator vouches; half a minute after a cancellation."""
     session = scored(rig)
     rig.create("r1", agent=HERE)
     rig.play(session, *rig.poll(session, 8))
@@ -281,6 +293,9 @@ def earlier_version(rig: Rig, message: type[wire.Message], **fields: Any) -> Any
 
 @pytest.mark.parametrize("by", ["its own gateway", "another gateway", "another worker", "its own worker"])
 def test_no_report_of_another_boot_id_ends_a_permit(rig: Rig, by: str) -> None:
+    """Attack: the gateway of another run, or a worker, reports a new boot id of the agent's machine, as if
+    it had been restarted. Defence: no report of another party ends a permit, and none of its own
+    gateway but `CloseRun`."""
     session = scored(rig)
     for run in ("r1", "r2"):
         rig.create(run, agent=None)
@@ -310,6 +325,8 @@ def test_a_permit_on_a_kernel_that_no_worker_names_bars_nothing(rig: Rig) -> Non
 @pytest.mark.parametrize("restart", [False, True])
 @pytest.mark.parametrize("there", [HERE, "another"])
 def test_a_stranger_under_a_lost_workers_name_frees_no_kernel(rig: Rig, there: str, restart: bool) -> None:
+    """Attack: a worker takes the name of a lost one that may still play, and states that it holds nothing.
+    Defence: a heartbeat releases only what is on its own kernel and was leased to its own machine."""
     session = scored(rig, machine="m1")
     leases = rig.poll(session, 8)
     assert "validation" in splits(leases)
@@ -326,6 +343,8 @@ def test_a_stranger_under_a_lost_workers_name_frees_no_kernel(rig: Rig, there: s
 
 
 def test_a_worker_on_another_kernel_speaks_for_no_earlier_one(rig: Rig) -> None:
+    """Attack: a worker takes the name of a lost one that may still play, and states that it holds nothing.
+    Defence: a heartbeat releases only what is on its own kernel and was leased to its own machine."""
     session = scored(rig)
     assert "validation" in splits(rig.poll(session, 8))
     session = rig.begin(worker={"slots": 8, "boot_id": "another"}, run={"agent": None})
@@ -350,6 +369,8 @@ def test_a_takeover_by_another_host_keeps_the_first_permit(rig: Rig) -> None:
 
 @pytest.mark.parametrize("by", ["open", "submit"])
 def test_an_agent_whose_gateway_asks_for_no_permit_may_be_anywhere(rig: Rig, by: str) -> None:
+    """Attack: its gateway requests no permit, or does not state its machine. Defence: it counts as present
+    on every machine."""
     session = scored(rig)
     hidden = rig.poll(session, 8)
     rig.create("r1", agent=None)
@@ -431,6 +452,8 @@ def test_case_sets_are_forgotten_with_their_last_user(rig: Rig) -> None:
 
 
 def test_a_gateway_may_name_only_so_many_kernels(rig: Rig) -> None:
+    """Attack: requests permits for ever more kernels, to keep hidden episodes from them and to fill the
+    database. Defence: 16 kernels for a run."""
     rig.register()
     rig.create(agent=None)
     answers = [rig.permit("r1", f"kernel-{n}") for n in range(20)]

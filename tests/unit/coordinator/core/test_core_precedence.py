@@ -177,6 +177,9 @@ def test_the_time_a_submit_is_held_counts_against_no_limit(rig: Rig) -> None:
 @pytest.mark.parametrize("where", ["", HERE])
 @pytest.mark.parametrize("restart", [False, True])
 def test_a_run_that_keeps_others_waiting_for_too_long_is_cancelled(where: str, restart: bool) -> None:
+    """Attack: its gateway claims all kernels, or an unknown one, and never closes the run, so that related
+    runs get no scores. Defence: the status names the run and the operator's commands; the run is
+    cancelled seven days after the start (`--agent-wait`)."""
     rig = Rig(agent_wait_s=600.0)
     session = rig.begin(worker={"slots": 8}, run={"agent": where})
     rig.create("r2", agent="remote")
@@ -200,6 +203,9 @@ def test_a_run_that_keeps_others_waiting_for_too_long_is_cancelled(where: str, r
 
 
 def test_an_agent_that_delays_others_is_named_until_its_limit() -> None:
+    """Attack: its gateway claims all kernels, or an unknown one, and never closes the run, so that related
+    runs get no scores. Defence: the status names the run and the operator's commands; the run is
+    cancelled seven days after the start (`--agent-wait`)."""
     rig = Rig(agent_wait_s=600.0)
     session = rig.register(slots=8)
     closed(rig, session, "r0")
@@ -215,6 +221,8 @@ def test_an_agent_that_delays_others_is_named_until_its_limit() -> None:
 
 
 def test_an_idle_worker_does_not_prevent_a_reservation(rig: Rig) -> None:
+    """Attack: a worker claims a kernel that does not exist, so that none is reserved for hidden cases.
+    Defence: kernels on which no worker plays or asks for jobs do not count."""
     session = rig.register(slots=8)
     closed(rig, session, "r0")
     rig.create("r1", agent=HERE)
@@ -344,6 +352,8 @@ def test_one_host_one_slot_and_four_runs_come_to_an_end() -> None:
 
 
 def test_related_train_and_hidden_jobs_never_share_a_kernel(rig: Rig) -> None:
+    """Attack: has a hidden episode signal a train episode beside it, whose feedback reaches an agent
+    anywhere. Defence: train and hidden jobs of related runs are never leased on one kernel."""
     first, second = rig.register("w1", slots=4, boot_id="one"), rig.register("w2", slots=4, boot_id="one")
     closed(rig, first, "r0")
     rig.play(first, *[lease for lease in rig.poll(first, 8) if split_of(lease.job) == "random"])
@@ -364,6 +374,8 @@ def test_related_train_and_hidden_jobs_never_share_a_kernel(rig: Rig) -> None:
 
 
 def test_a_rescore_waits_for_agents_of_related_runs(rig: Rig) -> None:
+    """Attack: listens while finished runs, with which it shares hidden cases, are re-scored on further
+    cases. Defence: a re-score counts as sharing its run's hidden cases."""
     session = rig.begin(worker={"slots": 8}, run={"agent": HERE})
     hidden = rig.core.state.runs["r1"].row.heldout
 

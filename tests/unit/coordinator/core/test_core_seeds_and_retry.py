@@ -22,6 +22,8 @@ def test_a_policy_seed_is_the_keyed_hash_that_the_protocol_names() -> None:
 
 
 def test_no_two_episodes_of_a_run_share_a_policy_seed() -> None:
+    """Attack: relies on the random numbers of an earlier submit. Defence: a keyed hash of submit, split,
+    case, and occurrence."""
     seeds = {
         policy_seed(b"s", submit, split, case, time)
         for submit in range(-1, 4)

@@ -1,4 +1,10 @@
-"""Which definitions of environments a coordinator listens to, and what it takes for a run to be played in one."""
+"""Which definitions of environments a coordinator listens to, and what it takes for a run to be played in one.
+
+Attacks, each with its defence:
+- is registered with an easier definition, or with a task text that injects instructions: shipped environments
+  must have the shipped digest, others a digest that the operator approved; texts are bounded and have no
+  invisible characters; a run keeps its definition to the end.
+"""
 
 from __future__ import annotations
 

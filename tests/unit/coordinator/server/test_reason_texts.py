@@ -90,6 +90,9 @@ def test_a_tier_that_does_not_work_is_told_with_its_workers() -> None:
 
 
 def test_why_an_environment_failed_is_told_to_operators_alone() -> None:
+    """Attack: fails its try-out with an error that tells an agent of the machine's files and code.
+    Defence: agents learn on which worker it failed; only operators get the reason, of at most 2,000
+    characters, and 64 KiB for all of a worker."""
     about = {"env": "my/x", "tier": "bwrap", "same_versions": False, "away": (), "connected": True}
     why = 'step 3: it raised KeyError: 7; File "/home/me/secret.py", line 3'
     waits = because("workers", lacking=(), failed=(("lab-1", why), ("lab-2", "another")), **about)

@@ -1,4 +1,10 @@
-"""Runs that play another one again: its cases and its secret are given to its own operator, once it is over."""
+"""Runs that play another one again: its cases and its secret are given to its own operator, once it is over.
+
+Attacks, each with its defence:
+- opens a run as a replay, to get another run's hidden cases and random seeds, or to hide a run from the count
+  of runs: only the operator with the run's key, after the run's end, with the same settings; marked in the
+  journal, and never published or in a report.
+"""
 
 from __future__ import annotations
 

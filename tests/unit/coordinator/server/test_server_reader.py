@@ -173,6 +173,9 @@ def test_a_gateway_is_not_told_whether_others_have_stored_a_blob(rig: Rig) -> No
 
 
 def test_unclaimed_uploads_of_a_run_are_limited(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Attack: uploads bundles that it never submits, until the coordinator's disk is full. Defence: 16
+    uploads of 256 MiB together may be named by no submit of the run; they are deleted within a minute
+    after it was closed (after a restart of the coordinator, by `evopolicy-coordinator gc`)."""
     monkeypatch.setattr(uploads_module, "MAX_UNCLAIMED", 3)
     monkeypatch.setattr(uploads_module, "MAX_UNCLAIMED_BYTES", 100)
     bundles = [b"a", b"bb", b"ccc", b"dddd"]

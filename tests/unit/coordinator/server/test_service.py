@@ -453,6 +453,9 @@ async def test_an_answer_that_cannot_be_made_holds_up_no_other(
 async def test_uploads_that_no_submit_named_are_deleted_once_their_run_is_over(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """Attack: uploads bundles that it never submits, until the coordinator's disk is full. Defence: 16
+    uploads of 256 MiB together may be named by no submit of the run; they are deleted within a minute
+    after it was closed (after a restart of the coordinator, by `evopolicy-coordinator gc`)."""
     monkeypatch.setattr(service, "_SWEEP_S", 0.05)
 
     async with started(tmp_path) as world:

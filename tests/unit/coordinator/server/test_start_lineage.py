@@ -1,4 +1,12 @@
-"""Runs that start from a submit of another: the coordinator believes its own rows, not the operator."""
+"""Runs that start from a submit of another: the coordinator believes its own rows, not the operator.
+
+Attacks, each with its defence:
+- an operator forges the lineage of a run, or starts from a run of another cluster, or of another user: the
+  digest must be the one that the earlier run's gateway sent; the run's folder must be the operator's own.
+- an operator picks the start by its hidden result, or has hidden cases played beside the agent that
+  continues: `parent_scored` is the coordinator's, and handed on; both runs are related; such runs are on no
+  leaderboard.
+"""
 
 from __future__ import annotations
 

@@ -96,6 +96,8 @@ def test_strikes_that_an_earlier_version_wrote_are_read_past(path: Path) -> None
 
 
 def test_the_journal_can_only_grow(path: Path) -> None:
+    """Attack: change or cut the journal. Defence: the heads that `run.json` and reports print no longer
+    match."""
     store = Store(path)
     first = JournalRow(seq=0, head="a", entry=b"one")
     last = JournalRow(seq=1, head="b", entry=b"two", reveals="epoch")

@@ -1,4 +1,21 @@
-"""Attacks on the live view: each would show, change or read what it must not, were its defence not there."""
+"""Attacks on the live view: each would show, change or read what it must not, were its defence not there.
+
+Attacks, each with its defence:
+- an agent without a jail opens it on loopback: a token is needed everywhere; it is never in a path or query,
+  and a reading token cannot act.
+- a foreign page's host name resolves to it (DNS rebinding), or begins like an address (`[::1].evil.example`):
+  the whole `Host` must be an address or one of its own names.
+- a foreign page posts to it, or loads its files: `Origin` must be exactly its scheme, host and port, and
+  `Sec-Fetch-Site` is checked; the cookie is `SameSite=Strict`.
+- opens ever more connections and never completes a request: the head must arrive within 20 s and a form
+  within 10 s; beyond 256 connections, a new one replaces the oldest without a complete request.
+- code, names, logs, or SVG of an agent hold markup: templates escape everything; no inline script or style
+  (content security policy); files are sandboxed text, pictures, or video.
+- a path or a link in a run directory leads out of it: paths are opened part by part without following links;
+  pipes are not opened; `.gateway/`, `AGENTS.md`, `run.json` and logs are not served.
+- hidden results are read while an agent of a related run is alive: every page, the report, and the replays
+  omit them until no such agent is alive; a named cluster that does not answer counts as having one.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,9 @@
-"""Agents that take all they can get of their machine: what bounds or ends them, and what is told of it."""
+"""Agents that take all they can get of their machine: what bounds or ends them, and what is told of it.
+
+Attacks, each with its defence:
+- starts processes without end, takes all memory, fills shared memory or the disk: cgroups; bounded memory
+  file systems, read-only elsewhere; measured files, deleted ones included.
+"""
 
 from __future__ import annotations
 

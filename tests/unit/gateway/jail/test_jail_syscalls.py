@@ -1,4 +1,10 @@
-"""System calls that the jail's filter refuses, on every processor that has tables of calls."""
+"""System calls that the jail's filter refuses, on every processor that has tables of calls.
+
+Attacks, each with its defence:
+- leaves a set-id program, which runs with the operator's rights for every local user, also root's: the filter
+  refuses set-id bits in every call that gives a file its mode, and calls that it cannot read or does not
+  know; no other user may enter a run's folder; closing the run takes such bits away, also without a jail.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,9 @@
-"""Which files a program's jail shows, and which it covers."""
+"""Which files a program's jail shows, and which it covers.
+
+Attacks, each with its defence:
+- leaves a link in its home or /tmp where its next start mounts something, so that bubblewrap follows it to
+  the machine: links on the way to a mount are removed before each start.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,8 @@
-"""The operator's terminal shows why runs wait, and nothing of an agent's that steers it."""
+"""The operator's terminal shows why runs wait, and nothing of an agent's that steers it.
+
+Attacks, each with its defence:
+- prints terminal escape sequences: shown as plain characters.
+"""
 
 from __future__ import annotations
 

@@ -56,6 +56,9 @@ def test_a_call_is_recorded_whole_and_once(tmp_path: Path, path: str, protocol: 
 
 
 def test_no_secret_is_in_the_record_however_it_came(tmp_path: Path) -> None:
+    """Attack: sends keys to its model, so that the record has them. Defence: removed by the rules of logs,
+    in requests, answers and headers; encoded keys, and those split over parts of a stream, are not
+    found."""
     named = "plain-words-of-a-variable"
 
     async def act(served: Served) -> None:
@@ -76,6 +79,8 @@ def test_no_secret_is_in_the_record_however_it_came(tmp_path: Path) -> None:
 def test_a_flood_ends_the_record_and_not_the_run(
     tmp_path: Path, limit: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """Attack: floods the record of model calls. Defence: calls and bytes are bounded; recording stops, the
+    run goes on."""
     most = 3 if limit == "MAX_CALLS" else 4000
     monkeypatch.setattr(model_record, limit, most)
 

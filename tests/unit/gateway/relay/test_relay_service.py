@@ -1,4 +1,9 @@
-"""The relay between an HTTP client and a model API on loopback."""
+"""The relay between an HTTP client and a model API on loopback.
+
+Attacks, each with its defence:
+- a provider that answers with web pages, half answers, wrong counts, or a compressed bomb: read within
+  bounds; counts that cannot be are estimated and marked.
+"""
 
 from __future__ import annotations
 
@@ -64,6 +69,8 @@ def test_only_the_agents_token_is_accepted(tmp_path: Path) -> None:
 
 
 def test_a_key_that_the_provider_repeats_does_not_reach_the_agent(tmp_path: Path) -> None:
+    """Attack: searches every file and process of its jail for the key. Defence: the key is in the relay
+    alone; an answer that repeats it is changed."""
     upstream = {"headers": {"x-team": "other-secret"}}
     (answer,), served = asked(tmp_path, [Step(odd=odd_answers.repeats_its_headers)], {}, upstream=upstream)
     assert answer.status_code == 400
@@ -88,6 +95,8 @@ def test_azure_gets_its_header_and_version(tmp_path: Path) -> None:
 
 
 def test_requests_beyond_a_limit_are_refused_in_the_providers_form(tmp_path: Path) -> None:
+    """Attack: makes requests beyond its budget, many at once. Defence: requests in flight count."""
+
     async def act(served: Served) -> None:
         answers = await asyncio.gather(*(served.ask() for _ in range(8)))
         assert sorted(each.status_code for each in answers)[:3] == [200, 200, 200]

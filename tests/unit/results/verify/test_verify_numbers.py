@@ -1,5 +1,13 @@
 """Edited numbers of a run directory: each is found without playing, by the other numbers or by the coordinator's
-result."""
+result.
+
+Attacks, each with its defence:
+- a run directory with edited scores, means, selection, budget, feedback or metadata, swapped policies, or
+  submits and episodes left out: `evopolicy verify` names each: numbers must follow from each other and be
+  those that the coordinator has. Without the coordinator that played the run, edits that contradict nothing
+  in the directory are found only where a train episode shows them; the output says so. Re-scores are checked
+  against the run, and the output names those whose returns were not played again.
+"""
 
 from __future__ import annotations
 

@@ -54,6 +54,9 @@ def returned(slots: Slots, slot: Slot, record: str) -> float:
 
 
 def test_a_process_that_has_played_a_hidden_episode_plays_no_train_episode(slots: Slots) -> None:
+    """Attack: comes with the user (`--env my_pkg:MyEnv-v0`), remembers a hidden episode in memory or in a
+    file, and lets it determine rewards of train episodes. Defence: a process that has played part of a
+    hidden episode of such an environment plays no train episode; its folders are emptied."""
     with slots.running(slot_of(slots, "Keeper")) as slot:
         assert [returned(slots, slot, "full") for _ in range(2)] == [1.0, 2.0]
         assert [returned(slots, slot, "actions") for _ in range(2)] == [3.0, 4.0]
@@ -63,6 +66,9 @@ def test_a_process_that_has_played_a_hidden_episode_plays_no_train_episode(slots
 def test_a_process_replaced_in_a_hidden_episode_plays_no_train_episode(
     slots: Slots,
 ) -> None:
+    """Attack: comes with the user (`--env my_pkg:MyEnv-v0`), remembers a hidden episode in memory or in a
+    file, and lets it determine rewards of train episodes. Defence: a process that has played part of a
+    hidden episode of such an environment plays no train episode; its folders are emptied."""
     with slots.running(slot_of(slots, "Keeper", kwargs={"dies_of": 0.89})) as slot:
         # The policy's action ends the first process; random actions, which are smaller, play the episode again.
         (outcome,) = slots.play_all(PUSHES, slot=slot, env="acme/Keeper", record="actions")
@@ -219,6 +225,9 @@ def test_what_prevents_an_episode_is_reported_by_name_and_is_nobodys_result(
 def test_an_environment_that_hangs_on_actions_gives_no_second_throw(
     slots: Slots, how: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """Attack: makes an environment hang on its actions in hidden episodes, also where it holds Python's
+    interpreter, for a second attempt or a run that never ends. Defence: its actions are in a file of
+    the slot, and the next attempt plays them; in the fourth one the hang is its failure."""
     monkeypatch.setattr(slot_module, "_CHECK_S", 0.5)
     monkeypatch.setattr(slot_module, "SILENT_S", 8.0)
     slot = slot_of(slots, "Bad", Limits(call_s=4.0), kwargs={"how": f"{how} when pushed"})

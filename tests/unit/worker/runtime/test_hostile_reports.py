@@ -1,5 +1,10 @@
 """All bytes from a policy's process are bounded and checked before they are used, and never cost the slot or
-the episode."""
+the episode.
+
+Attacks, each with its defence:
+- forges a report or an action that breaks its reader or encoder: bounds at the reader; each outcome is
+  encoded within the error handling of its own episode.
+"""
 
 from __future__ import annotations
 

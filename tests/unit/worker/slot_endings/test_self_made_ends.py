@@ -105,6 +105,9 @@ CLOCKED = acting(
 @pytest.mark.parametrize("tier", ["bwrap", "landlock"])
 @pytest.mark.parametrize("at", [4, 60])
 def test_a_policy_whose_luck_is_the_clock_never_throws_again(slots: Slots, tier: str, at: int) -> None:
+    """Attack: ends itself, its sandbox, or its environment after bad luck, to be played again. Defence:
+    every end that it can cause is its result; after a restart, the actions that it returned remain
+    valid (table in `docs/explanation/hostile-policies.md`)."""
     limits = msgspec.structs.replace(QUICK, act_wall_s=1.0, cpu_s=1.5)
     slot = slots.slot(tier)  # type: ignore[arg-type]
     slots.play(HONEST, tier=tier)
@@ -121,6 +124,9 @@ def test_a_policy_whose_luck_is_the_clock_never_throws_again(slots: Slots, tier:
 
 
 def test_what_a_policy_had_returned_stands_when_it_is_started_again(slots: Slots) -> None:
+    """Attack: ends itself, its sandbox, or its environment after bad luck, to be played again. Defence:
+    every end that it can cause is its result; after a restart, the actions that it returned remain
+    valid (table in `docs/explanation/hostile-policies.md`)."""
     luck = "luck = (time.time_ns() // 1000 % 1_000_000) / 1e6; print(luck, flush=True); return [luck]"
     source = CLOCKED.replace("return [(time.time_ns() % 1000) / 1000]", luck)
     source = source.replace("WAY", "time.sleep(3)").replace("AT", "31")
