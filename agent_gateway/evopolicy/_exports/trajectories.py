@@ -8,6 +8,7 @@ precision for numbers, bytes for pictures, and `Discrete` for whole numbers.
 from __future__ import annotations
 
 import errno
+import hashlib
 import json
 import os
 import re
@@ -33,6 +34,7 @@ _LAST = "The observation after an episode's last step is a copy of the one befor
 def write_minari(runs: Runs, out: Path) -> list[Path]:
     """Writes datasets named `evopolicy/<environment>/<entry>-v0` below `out`; `MINARI_DATASETS_PATH=out` reads them.
 
+    Entries whose names are equal but for other characters than ASCII letters and digits get a digest before `-v0`.
     Episodes whose values fit no space, or not that of the others, are left out and named on stderr. Raises ConfigError
     when a dataset is there already, or when no run has trajectories.
     """
@@ -41,12 +43,14 @@ def write_minari(runs: Runs, out: Path) -> list[Path]:
     from minari.serialization import deserialize_space
 
     known_as = names(runs)
-    groups: dict[str, list[Run]] = {}
+    groups: dict[tuple[str, str], list[Run]] = {}
     for run in runs:
-        known = run.summary
-        groups.setdefault(f"evopolicy/{_slug(known.env)}/{_slug(known.entry)}-v0", []).append(run)
+        groups.setdefault((run.summary.env, run.summary.entry), []).append(run)
+    slugs = {key: f"evopolicy/{_slug(key[0])}/{_slug(key[1])}" for key in groups}
+    shared = Counter(slugs.values())
     written = []
-    for name, members in groups.items():
+    for key, members in groups.items():
+        name = slugs[key] + (f"-{_digest(key)}" if shared[slugs[key]] > 1 else "") + "-v0"
         if (out / name).exists():
             raise ConfigError(f"{out / name} is there already; remove it, or choose another --out")
         episodes = [each for run in members for each in _episodes(run, known_as[str(run.folder)])]
@@ -104,6 +108,11 @@ def _left_out(about: dict[str, Any], why: str) -> None:
 
 def _slug(text: str) -> str:
     return re.sub(r"[^A-Za-z0-9]+", "-", text).strip("-") or "x"
+
+
+def _digest(key: tuple[str, str]) -> str:
+    """Tells datasets apart whose names have no other letters and digits."""
+    return hashlib.sha256("\n".join(key).encode(errors="backslashreplace")).hexdigest()[:8]
 
 
 def _episodes(run: Run, name: str) -> Iterator[tuple[Any, dict[str, Any]]]:

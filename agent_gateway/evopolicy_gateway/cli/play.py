@@ -24,7 +24,7 @@ from evopolicy_gateway.cli.options import Of, Shown, spread
 from evopolicy_gateway.jail.settings import JailSettings
 from evopolicy_gateway.operator.cluster import Cluster
 from evopolicy_gateway.run import recorded_agent
-from evopolicy_gateway.run.plan import Plan
+from evopolicy_gateway.run.plan import Plan, check_apart
 from evopolicy_gateway.run.run_options import (
     ClusterOptions,
     ListenerOptions,
@@ -285,6 +285,7 @@ def _plans(given: RunOptions, env_ids: list[str], agent_host: str = "", **more: 
     if given.resume and (given.overwrite or given.exp_id is None):
         raise ConfigError("--resume needs --exp-id, and cannot be combined with --overwrite")
     plans = given.plans(env_ids, Path.cwd(), agent_host, **more)
+    check_apart(plans)
     for plan in plans:
         plan.check()
     return plans

@@ -4,19 +4,22 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import os
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 import msgspec
 
 from evopolicy_common import catalogue
-from evopolicy_common.errors import ConfigError
+from evopolicy_common.errors import ConfigError, EvopolicyError
 from evopolicy_common.messages.environment import StepLimit
 from evopolicy_common.messages.run_settings import RunSettings
 from evopolicy_common.processes.preflight import check_installed, check_loopback, check_text, check_writable
 from evopolicy_common.processes.scratch import remove_tree
 from evopolicy_common.records.model_record import Level
 from evopolicy_common.records.open_run import IntendedRun
+from evopolicy_common.records.run_files import read_record
 from evopolicy_common.records.run_record import AgentLimits
 from evopolicy_gateway import harnesses
 from evopolicy_gateway.harnesses.interface.agent_config import AgentConfig
@@ -193,6 +196,7 @@ class Plan(msgspec.Struct, frozen=True, kw_only=True):
             return
         if not (folder.run_json.exists() or folder.state.exists() or not any(folder.root.iterdir())):
             raise ConfigError(f"{folder.root} is not a run's folder; choose another --runs or --exp-id")
+        self.check_owner()
         if self.resume and (intended := self.intended()) is not None:
             if intended.settings.inputs != self.settings.inputs:
                 raise ConfigError(
@@ -210,6 +214,21 @@ class Plan(msgspec.Struct, frozen=True, kw_only=True):
                 f"{folder.root} holds {kind} run; choose another --exp-id, or replace it with --overwrite{more}"
             )
 
+    def check_owner(self) -> None:
+        """Raises ConfigError when the folder holds a run of another entry or environment."""
+        own = held = (self.entry, self.settings.env)
+        if (intended := self.intended()) is not None:
+            held = (intended.settings.entry, intended.settings.env)
+        else:
+            with contextlib.suppress(OSError, EvopolicyError):
+                record = read_record(self.folder.root)
+                held = (record.agent.entry, record.env)
+        if held != own:
+            raise ConfigError(
+                f"{self.folder.root} holds a run of {held[0]!r} on {held[1]!r}, not of {own[0]!r} on {own[1]!r}: here"
+                " their folders have one name. Choose another --entry, --exp-id or --runs"
+            )
+
     def intended(self) -> IntendedRun | None:
         """The request that opened the run in the folder; None when there is none."""
         with contextlib.suppress(FileNotFoundError):
@@ -222,6 +241,18 @@ class Plan(msgspec.Struct, frozen=True, kw_only=True):
         if self.folder.root.exists():
             remove_tree(self.folder.root)
         self.folder.root.mkdir(mode=0o700, parents=True)
+
+
+def check_apart(plans: Iterable[Plan]) -> None:
+    """Raises ConfigError when two runs would share a folder, here or on a file system that ignores case."""
+    known: dict[str, Plan] = {}
+    for plan in plans:
+        other = known.setdefault(os.fspath(plan.folder.root).casefold(), plan)
+        if other is not plan:
+            raise ConfigError(
+                f"{other.entry!r} on {other.settings.env!r} and {plan.entry!r} on {plan.settings.env!r} would share"
+                " one folder, at least where a file system ignores case; give one of them another name"
+            )
 
 
 def _unusual(values: dict[str, Any], usual: dict[str, Any]) -> dict[str, Any]:

@@ -1,12 +1,15 @@
 """Paths of a run's files: `runs/<entry>/<env with _ for / and :>/<exp-id>/`, with the contents listed in `protocol.md`.
 
+An entry's folder has its name, and a digest where a folder cannot have the name (`entry_folder`).
+
 While a run is open its folder also holds `.gateway/` (mode 0700): the gateway's credentials, its port and token, the
 journal and the bundles. It lies outside the workspace and is removed when `run.json` is written.
 """
 
 from __future__ import annotations
 
-import re
+import hashlib
+import unicodedata
 from pathlib import Path
 from typing import TypeVar
 
@@ -19,11 +22,15 @@ from evopolicy_common.records.blobs import write_atomically
 from evopolicy_common.records.policies.trees import HISTORY, TREES
 from evopolicy_common.records.run_record import Artifacts
 from evopolicy_common.records.secrets import PASSED
+from evopolicy_common.records.suite_folder import INDEX, PAUSED
 from evopolicy_common.wire import keys
 
 T = TypeVar("T")
 
-_ODD = re.compile(r"[^A-Za-z0-9._()+ -]")
+_PLAIN = frozenset("._()+ -")
+"""Characters of folder names besides letters, digits and their marks."""
+_MAX_BYTES = 100
+"""Of an entry's folder, without its digest."""
 
 
 class Place:
@@ -141,14 +148,28 @@ class Staged(msgspec.Struct, frozen=True, kw_only=True):
     max_episodes_per_submit: int
 
 
+def entry_folder(entry: str) -> str:
+    """The name of an entry's folder: the entry in NFC, 100 bytes at most, with `_` for each character that is not a
+    letter, mark, digit or `._()+ -`, and without spaces and dots at its ends.
+
+    Where that is not the whole name, or names a file of a sweep, 8 hexadecimal digits of the name's SHA-256 follow.
+    Raises ConfigError for a name of spaces and dots alone.
+    """
+    text = unicodedata.normalize("NFC", entry)
+    kept = (one if one in _PLAIN or unicodedata.category(one)[0] in "LMN" else "_" for one in text)
+    name = "".join(kept).encode()[:_MAX_BYTES].decode(errors="ignore").strip(" .")
+    if not name:
+        raise ConfigError(f"entry {entry!r}: a name of more than spaces and dots is needed")
+    if name == text and name.casefold() not in (INDEX, PAUSED):
+        return name
+    return f"{name}-{hashlib.sha256(text.encode(errors='backslashreplace')).hexdigest()[:8]}"
+
+
 def run_folder(runs: Path, entry: str, env: str, exp_id: str) -> RunFolder:
     """Returns the folder of a run. Raises ConfigError for names that cannot be a folder's."""
     if not keys.valid_name(exp_id):
         raise ConfigError(f"--exp-id {exp_id!r}: letters, digits, '.', '_' and '-' only, 63 at most")
-    name = _ODD.sub("_", entry).strip(" .")
-    if not name or len(name) > 100:
-        raise ConfigError(f"entry {entry!r}: a name of 1 to 100 characters is needed")
-    above = runs.absolute() / name
+    above = runs.absolute() / entry_folder(entry)
     earlier = RunFolder(above / earlier_folder_name(env) / exp_id)
     # Also while a run is replaced, whose folder is missing for moments: the lock is beside it.
     if any(path.exists() for path in (earlier.root, earlier.lock, earlier.asked)):

@@ -288,7 +288,8 @@ def _opened(run: Plan) -> str:
 
 
 async def facts_of(run: Plan, index: Index, operations: Operations) -> Facts:
-    """Collects the known facts about a run."""
+    """Collects the known facts about a run. Raises ConfigError when its folder holds another's."""
+    run.check_owner()
     folder, entry = run.folder, index.runs.get(run.name)
     with contextlib.suppress(OSError, EvopolicyError):
         return Facts(entry=entry, status=suite_index.state_of(read_record(folder.root)))

@@ -24,7 +24,7 @@ from evopolicy_common.wire import keys
 from evopolicy_gateway.declared import Count, suite_keys
 from evopolicy_gateway.harnesses.interface.agent_config import AgentConfig
 from evopolicy_gateway.jail.settings import JailSettings
-from evopolicy_gateway.run.plan import Plan
+from evopolicy_gateway.run.plan import Plan, check_apart
 from evopolicy_gateway.run.run_options import RunOptions, limits_from
 
 if TYPE_CHECKING:
@@ -162,6 +162,7 @@ def expand(suite: SuiteFile, root: Path, started_in: Path, only: tuple[str, ...]
                 raise ConfigError("a name without '/' is needed")
             run.harness()
             run.jail.check()
+    check_apart(runs)
     return runs
 
 

@@ -294,6 +294,15 @@ def test_minari_leaves_out_odd_episodes_and_keeps_each_with_its_own_facts(
     assert (dataset.total_episodes, metadata["case"], metadata["episode_return"]) == (1, 3, 4.0)
 
 
+def test_minari_keeps_entries_apart_whose_letters_it_cannot_name(tmp_path: Path) -> None:
+    for entry in ("模型甲", "模型乙"):
+        run = write_run(tmp_path / "runs" / entry, VERSIONS[:1], entry=entry)
+        write_episode(run, 0, 0, [ROW])
+    exported(tmp_path / "runs", "--to", "minari", "--out", tmp_path / "sets")
+    names = [path.name for path in (tmp_path / "sets/evopolicy/gym-acrobot").glob("*-v0")]
+    assert [bool(re.fullmatch("x-[0-9a-f]{8}-v0", name)) for name in names] == [True, True], names
+
+
 def test_a_sweep_is_followed_to_its_end_and_shows_nothing_hidden_before(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

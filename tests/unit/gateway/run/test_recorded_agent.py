@@ -43,22 +43,28 @@ def test_other_versions_explain_a_difference_and_are_none(tmp_path: Path) -> Non
     assert recorded_agent.outcome(run, again) == "run.json: outcome.final_score: -13.0 and -7.0"
 
 
+def kept_of(made: Plan, **ports: int) -> Path:
+    """The folder of a finished run that can be replayed."""
+    root = written(made, "1.0.0", -13.0)
+    known = {"run": "r", "key": "k", "token": "t", "model_token": "m"}
+    replays = Replays(
+        folder=made.folder.model_record, root=root, **known, **{"port": 0, "model_port": 0} | ports
+    )
+    recorded_agent.keep(made.folder, made, replays)
+    return root
+
+
+def test_a_replay_does_not_take_the_place_of_its_run(tmp_path: Path) -> None:
+    root = kept_of(plan(tmp_path, "runs"))
+    with pytest.raises(ConfigError, match=r"would take the place of .*choose another --runs"):
+        recorded_agent.plan_of(root, tmp_path / "runs", trusted=True)
+    assert recorded_agent.plan_of(root, tmp_path / "replayed", trusted=True).overwrite
+
+
 @pytest.mark.parametrize("taken", ["port", "model_port"])
 def test_a_taken_port_is_named_with_the_remedy(tmp_path: Path, taken: str) -> None:
-    made = plan(tmp_path, "runs")
-    written(made, "1.0.0", -13.0)
     with socket.create_server(("127.0.0.1", 0)) as server:
-        ports = {"port": 0, "model_port": 0, taken: server.getsockname()[1]}
-        folder = made.folder
-        kept = Replays(
-            folder=folder.model_record,
-            root=folder.root,
-            run="r",
-            key="k",
-            token="t",
-            model_token="m",
-            **ports,
-        )
-        recorded_agent.keep(folder, made, kept)
-        with pytest.raises(ConfigError, match=rf"port {ports[taken]} on 127.0.0.1, .*end what listens there"):
-            recorded_agent.plan_of(folder.root, tmp_path / "replayed", trusted=True)
+        port = server.getsockname()[1]
+        root = kept_of(plan(tmp_path, "runs"), **{taken: port})
+        with pytest.raises(ConfigError, match=rf"port {port} on 127.0.0.1, .*end what listens there"):
+            recorded_agent.plan_of(root, tmp_path / "replayed", trusted=True)

@@ -210,7 +210,7 @@ def test_a_run_of_an_earlier_version_keeps_its_folder(existing: str, tmp_path: P
 
 def test_a_runs_folder_has_no_surprises_in_its_name(tmp_path: Path) -> None:
     folder = run_folder(tmp_path, "GPT-5.5 (Codex)/../x", "gym/acrobot", "first")
-    assert folder.root == tmp_path / "GPT-5.5 (Codex)_.._x" / "gym_acrobot" / "first"
+    assert folder.root == tmp_path / "GPT-5.5 (Codex)_.._x-e5823f47" / "gym_acrobot" / "first"
     assert (
         run_folder(tmp_path, "e", "my_env:Glider-v0", "a").root == tmp_path / "e" / "my_env_Glider-v0" / "a"
     )
