@@ -14,7 +14,7 @@ import re
 import signal
 import sys
 from collections.abc import Iterable, Mapping
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TextIO
 
 from evopolicy_common.installation import as_called
 
@@ -156,14 +156,28 @@ def open_streams() -> None:
             setattr(sys, name, os.fdopen(fd, mode, closefd=False))
 
 
+class _LossyStderr(io.FileIO):
+    """Stderr that loses what cannot be written (disk full, reader gone), so that it does not change the exit code."""
+
+    def write(self, data: Buffer, /) -> int:
+        try:
+            return super().write(data)
+        except OSError:
+            return len(memoryview(data))
+
+
 def end_without_reader() -> None:
-    """Makes the program exit with `READER_GONE` when it prints to a closed pipe, as in `evopolicy status | head -1`."""
-    stream = sys.stdout
+    """Makes the program exit with `READER_GONE` when it prints to a closed pipe, as in `evopolicy status | head -1`.
+    Stderr may be closed."""
+    sys.stdout = _replaced(sys.stdout, _WatchedStdout)
+    sys.stderr = _replaced(sys.stderr, _LossyStderr)
+
+
+def _replaced(stream: TextIO, raw: type[io.FileIO]) -> TextIO:
     if not isinstance(stream, io.TextIOWrapper):
-        return  # closed, or replaced by someone else
-    raw = _WatchedStdout(stream.fileno(), "wb", closefd=False)
-    sys.stdout = io.TextIOWrapper(
-        io.BufferedWriter(raw),
+        return stream  # closed, or replaced by someone else
+    return io.TextIOWrapper(
+        io.BufferedWriter(raw(stream.fileno(), "wb", closefd=False)),
         encoding=stream.encoding,
         errors=stream.errors,
         line_buffering=stream.line_buffering,

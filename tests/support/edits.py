@@ -14,8 +14,13 @@ def edited(path: Path) -> Iterator[Any]:
     """The file's document, which is written back as it is at the end."""
     document = json.loads(path.read_bytes())
     yield document
+    overwrite(path, json.dumps(document))
+
+
+def overwrite(path: Path, content: str | bytes) -> None:
+    """Writes a file that may be read-only."""
     path.chmod(0o644)
-    path.write_text(json.dumps(document))
+    path.write_bytes(content.encode() if isinstance(content, str) else content)
 
 
 def put(*path: str | int, value: Any) -> Callable[[Any], None]:

@@ -5,12 +5,12 @@ from __future__ import annotations
 
 import gc
 import importlib
-import json
 import os
-import subprocess
 import sys
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
+
+from helper_process import HelperProcess, serve
 
 BIN = Path(sys.executable).parent
 
@@ -27,23 +27,16 @@ class Forks:
     """The process that forks the commands."""
 
     def __init__(self) -> None:
-        self._process = subprocess.Popen(
-            [sys.executable, __file__], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
-        )
+        self._process = HelperProcess(__file__)
 
     def __call__(
         self, words: list[str], cwd: Path | None = None, *, unread: bool = False, **environment: str
     ) -> Ended:
         """The command with these words, to its end. `unread`: its standard output is a pipe that nobody reads."""
-        assert self._process.stdin is not None
-        assert self._process.stdout is not None
-        request = [words, str(cwd or Path.cwd()), unread, os.environ | environment]
-        self._process.stdin.write(json.dumps(request) + "\n")
-        self._process.stdin.flush()
-        return Ended(*json.loads(self._process.stdout.readline()))
+        return Ended(*self._process.ask([words, str(cwd or Path.cwd()), unread, os.environ | environment]))
 
     def close(self) -> None:
-        self._process.communicate()
+        self._process.close()
 
 
 def _output(unread: bool) -> int:
@@ -70,18 +63,21 @@ def _serve() -> None:
     commands()
     gc.collect()
     gc.freeze()  # or each child would look through, and so copy, all of it at its end
-    for line in sys.stdin:
-        words, cwd, unread, environment = json.loads(line)
-        outputs = _output(unread), os.memfd_create("stderr")
-        child = os.fork()
-        if not child:
-            _become(words, cwd, environment, *outputs)
-            return
-        status = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
-        texts = ["" if fd == outputs[0] and unread else os.pread(fd, 1 << 20, 0).decode() for fd in outputs]
-        print(json.dumps([status, *texts]), flush=True)
-        for fd in outputs:
-            os.close(fd)
+    serve(_played)
+
+
+def _played(request: list[Any]) -> list[Any]:
+    words, cwd, unread, environment = request
+    outputs = _output(unread), os.memfd_create("stderr")
+    child = os.fork()
+    if not child:
+        _become(words, cwd, environment, *outputs)
+        sys.exit()
+    status = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+    texts = ["" if fd == outputs[0] and unread else os.pread(fd, 1 << 20, 0).decode() for fd in outputs]
+    for fd in outputs:
+        os.close(fd)
+    return [status, *texts]
 
 
 if __name__ == "__main__":

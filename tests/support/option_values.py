@@ -11,7 +11,6 @@ import datetime as dt
 import functools
 import gc
 import importlib
-import json
 import os
 import resource
 import select
@@ -27,6 +26,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import typer
+from helper_process import HelperProcess, serve
 
 from evopolicy_gateway.harnesses import FORMS
 
@@ -131,6 +131,8 @@ environments = ["toy/line"]
 name = "random"
 agent = "random"
 """
+LOCKED = "home/here/locked"
+"""The folder of the value `locked`, which only root can read."""
 SECONDS = 60.0
 """The longest time of a command on a busy machine: none of these waits for anything."""
 BEGAN = 99
@@ -171,26 +173,22 @@ def cases() -> list[Case]:
 @contextlib.contextmanager
 def player(folder: Path) -> Iterator[Player]:
     """Plays cases below `folder`."""
-    program = [sys.executable, "-P", __file__, str(folder)]
-    paths = {"PYTHONPATH": str(Path(__file__).parent)}
-    with subprocess.Popen(
-        program, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=os.environ | paths
-    ) as process:
+    process = HelperProcess(__file__, str(folder))
+    try:
         yield Player(process)
-        process.stdin.close()
+    finally:
+        process.close()
 
 
 class Player:
     """The process that forks the commands."""
 
-    def __init__(self, process: subprocess.Popen[str]) -> None:
+    def __init__(self, process: HelperProcess) -> None:
         self._process = process
 
     def faults(self, case: Case) -> list[str]:
         """What is wrong with the command's answer to a bad value; empty if nothing is."""
-        self._process.stdin.write(json.dumps(case) + "\n")
-        self._process.stdin.flush()
-        return json.loads(self._process.stdout.readline())
+        return self._process.ask(case)
 
 
 class _Server:
@@ -328,9 +326,17 @@ class _Server:
                 sys.stderr.flush()
             end(code)
 
-    def _renew(self) -> None:
+    def remove(self) -> None:
+        """Removes the folder in which commands are played."""
+        with contextlib.suppress(FileNotFoundError):
+            (self._folder / "w" / LOCKED).chmod(0o700)
         shutil.rmtree(self._folder / "w", ignore_errors=True)
+
+    def _renew(self) -> None:
+        self.remove()
         subprocess.run(["cp", "-a", self._folder / "template", self._folder / "w"], check=True)
+        # Here and not in the template, which has to be read.
+        (self._folder / "w" / LOCKED).chmod(0)
         self._before = _tree(self._folder / "w")
 
     def _make(self, template: Path) -> None:
@@ -352,7 +358,6 @@ class _Server:
         (here / "folder" / "kept").write_text("kept\n")
         (here / "locked").mkdir()
         (here / "locked" / "file").write_bytes(bytes(range(256)))
-        (here / "locked").chmod(0)
         (here / "binary").write_bytes(bytes(range(256)) * 16)
         (here / "suite.toml").write_text(SUITE)
         (here / "policy").mkdir()
@@ -472,8 +477,10 @@ def _serve(folder: Path) -> None:
     gc.freeze()
     with socket.create_server(("127.0.0.1", 0)) as taken:
         server = _Server(folder, taken.getsockname()[1])
-        for line in sys.stdin:
-            print(json.dumps(server.faults(Case(*json.loads(line)))), flush=True)
+        try:
+            serve(lambda request: server.faults(Case(*request)))
+        finally:
+            server.remove()
 
 
 if __name__ == "__main__":

@@ -9,6 +9,7 @@ import signal
 from collections.abc import AsyncIterator, Mapping, Sequence
 from pathlib import Path
 
+from evopolicy_common.processes.child_process import ignore_broken_stdin
 from evopolicy_common.processes.parent_death import ending_with_parent
 from evopolicy_gateway.processes.agent_log import MAX_LINE_BYTES, AgentLog
 
@@ -47,6 +48,7 @@ class AgentProcess:
             start_new_session=True,
             pass_fds=tuple(pass_fds),
         )
+        ignore_broken_stdin(process)
         return cls(process, log)
 
     @property

@@ -62,6 +62,7 @@ class ChildProcess:
                     },
                 )
                 live.add(process.pid)
+        ignore_broken_stdin(process)
         return cls(process, log, log_start)
 
     @property
@@ -97,6 +98,13 @@ class ChildProcess:
     def _signal(self, number: signal.Signals) -> None:
         with contextlib.suppress(ProcessLookupError):
             self._process.send_signal(number)
+
+
+def ignore_broken_stdin(process: asyncio.subprocess.Process) -> None:
+    """Keeps Python 3.11.2 from logging a traceback when a child ends with unread input, as later versions do."""
+    if process.stdin is not None:
+        closed = process.stdin._protocol._get_close_waiter(process.stdin)  # type: ignore[attr-defined]
+        closed.add_done_callback(asyncio.Future.exception)
 
 
 def last_words(log: Path, since: int | None = None) -> str:

@@ -14,6 +14,7 @@ from typing import Any
 from urllib.parse import urlsplit
 
 import pytest
+from edits import overwrite
 from gateway_double import Double, gateway_on, opened, prepared, served
 
 from evopolicy_common.errors import ConfigError, StorageError
@@ -65,7 +66,7 @@ async def test_an_answer_survives_a_restart_and_a_changed_file(tmp_path: Path) -
     async with prepared(tmp_path) as (folder, double):
         async with gateway_on(folder, double) as s:
             before = await s.submit(IDS)
-        (folder.feedback / "submit_000" / "summary.json").write_text("{}")
+        overwrite(folder.feedback / "submit_000" / "summary.json", "{}")
         async with gateway_on(folder, double) as s:
             after = await s.http.get(f"{s.urls.submit}/submit_000")
             assert after.content == before.content

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from edits import overwrite
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from invented.policies import Version, policy
@@ -104,14 +105,14 @@ def damage_value(path: Path, rng: random.Random) -> None:
         return
     holder, key = rng.choice(list(places(document)))
     holder[key] = rng.choice(STRANGE)
-    path.write_text(json.dumps(document))
+    overwrite(path, json.dumps(document))
 
 
 def damage_bytes(path: Path, rng: random.Random) -> None:
     data = bytearray(path.read_bytes())
     for _ in range(rng.randint(1, 12) if data else 0):
         data[rng.randrange(len(data))] = rng.choice([0, 10, 34, 92, 128, 214, rng.randrange(256)])
-    path.write_bytes(data[: rng.randrange(len(data) + 1)] if rng.random() < 0.3 else data)
+    overwrite(path, data[: rng.randrange(len(data) + 1)] if rng.random() < 0.3 else data)
 
 
 def places(document: Any) -> Iterator[tuple[Any, Any]]:

@@ -165,7 +165,9 @@ def _python_files(allowed_packages: tuple[str, ...]) -> _PythonFiles:
     prefix = os.path.realpath(sys.base_prefix)
     read = [interpreter]
     if prefix == "/usr":
-        read += [sysconfig.get_path("stdlib"), sysconfig.get_path("platstdlib")]
+        # In a virtual environment `platstdlib` is the environment's own folder, which has all its packages.
+        base = {"platbase": sys.base_exec_prefix}
+        read += [sysconfig.get_path("stdlib"), sysconfig.get_path("platstdlib", vars=base)]
     else:
         # A separate prefix (pyenv, conda, uv, /usr/local) also has shared libraries beside the standard library.
         read.append(f"{prefix}/lib")

@@ -35,6 +35,7 @@ from evopolicy_common.logs import structlog
 from evopolicy_common.messages.environment import EnvironmentDescription
 from evopolicy_common.messages.episode import EpisodeOutcome, Job, PolicyFailure, Tier
 from evopolicy_common.processes import proc
+from evopolicy_common.processes.child_process import ignore_broken_stdin
 from evopolicy_common.processes.scratch import remove_tree
 from evopolicy_worker.environments.interface.calls import NOTE, USUAL, Limits, hung, last_words
 from evopolicy_worker.environments.registry import remembers
@@ -139,6 +140,7 @@ class Slot:
             # Of bubblewrap asyncio would kill the first process alone, and the second would wait for it forever.
             _kill(await starting)
             raise
+        ignore_broken_stdin(self._process)
         self._stderr.clear()
         self._listener = asyncio.create_task(self._listen(self._process))
         try:
