@@ -23,7 +23,9 @@ class Proof(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     family: str
     """Name of its suite."""
     env: str
-    """Where a policy of ours beats random actions, and which `evolve` plays in a whole run."""
+    """Where a policy of ours beats random actions, and which an agent plays in a whole run."""
+    agent: str = "evolve"
+    """That agent."""
     check: tuple[str, ...]
     """The environments that `check-env` plays."""
     check_steps: int = 100

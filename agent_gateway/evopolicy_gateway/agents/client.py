@@ -90,9 +90,10 @@ class Client:
             raise ProtocolError(f"GET {self.task_url} answered {status}: {body[:200]!r}")
         return body.decode("utf-8", "replace")
 
-    def submit(self, env_instances: list[int]) -> Verdict | Refusal:
-        """Submits the present `system/` on these train cases and waits for the verdict."""
-        key = uuid.uuid4().hex
+    def submit(self, env_instances: list[int], key: str | None = None) -> Verdict | Refusal:
+        """Submits the present `system/` on these train cases and waits for the verdict. `key`: of a submit that may
+        have been sent before; None: a new one."""
+        key = key or uuid.uuid4().hex
         body = json.dumps({"env_instances": env_instances}).encode()
         headers = {"Content-Type": "application/json", "Idempotency-Key": key}
         while True:

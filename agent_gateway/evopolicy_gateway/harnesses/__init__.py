@@ -82,7 +82,7 @@ def make(agent: str, started_in: Path, config: AgentConfig | None = None) -> Har
     if config is not None:
         return _cli_agent(config, started_in)
     if agent in _MODULES:
-        return CommandHarness(agent, _ours(_MODULES[agent]))
+        return CommandHarness(agent, _ours(_MODULES[agent]), continues=agent == "evolve")
     if agent == RemoteHarness.name:
         return RemoteHarness()
     if kind == "replay" and rest:

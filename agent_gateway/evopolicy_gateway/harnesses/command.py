@@ -38,10 +38,16 @@ class CommandHarness(Harness):
     """`command:PROGRAM…`, and the agents of this package."""
 
     def __init__(
-        self, name: str, program: list[str], settings: dict[str, Any] | None = None, hint: str = ""
+        self,
+        name: str,
+        program: list[str],
+        settings: dict[str, Any] | None = None,
+        hint: str = "",
+        continues: bool = False,
     ) -> None:
         """`hint`: a possible mistake in the command, shown if the program fails."""
         self.name = name
+        self.continues = continues
         self._program = program
         self.command = program
         self._settings = settings or {}

@@ -295,7 +295,10 @@ async def facts_of(run: Plan, index: Index, operations: Operations) -> Facts:
         return Facts(entry=entry, status=suite_index.state_of(read_record(folder.root)))
     if folder.opened_run.exists() and folder.credentials.exists():
         phase = await operations.phase(saved(folder.opened_run, OpenedRun).run)
-        has_session = run.harness().resumable and session.load(folder.session).session is not None
+        harness = run.harness()
+        has_session = harness.continues or (
+            harness.resumable and session.load(folder.session).session is not None
+        )
         return Facts(entry=entry, opened=True, phase=phase, has_session=has_session)
     intended = run.intended()
     settings = msgspec.structs.replace(run.settings, attempt=1 if entry is None else entry.attempt)

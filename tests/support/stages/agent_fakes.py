@@ -20,7 +20,7 @@ Play = Callable[[Any, int], tuple[float, list[dict[str, Any]]]]
 
 def load_policy(system: Path) -> Any:
     """The Policy class of a staged bundle, imported as the runner would: with the bundle first on the path."""
-    for name in [n for n in sys.modules if n == "policy" or n.split(".")[0] == "evolved"]:
+    for name in [n for n in sys.modules if n == "policy"]:
         del sys.modules[name]
     sys.path.insert(0, str(system))
     importlib.invalidate_caches()
@@ -59,6 +59,7 @@ class FakeGateway:
         return {
             "state": {"remaining_budget": self.left, "n_submits": len(self.submits), "is_finalized": False},
             "env_meta": meta | {"n_env_instances": self.n_cases, "max_episode_steps": 50},
+            "episode_budget": self.budget,
             "min_episodes_per_submit": self.min_per_submit,
             "max_episodes_per_submit": self.max_per_submit,
         }
@@ -101,6 +102,7 @@ class FakeGateway:
         summary = {
             "status": status,
             "returns": returns if status == "ok" else None,
+            "mean_return": sum(returns) / len(returns) if status == "ok" else None,
             "env_instances": env_instances,
             "n_episodes": len(env_instances),
             "first_global_episode": first,
@@ -109,6 +111,9 @@ class FakeGateway:
             "remaining_budget": self.left - len(env_instances),
         }
         self.submits.append(summary)
+        folder = self.workspace / "feedback" / submit_id
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / "summary.json").write_text(json.dumps(summary))
         return submit_id
 
 

@@ -116,6 +116,8 @@ class Harness(ABC):
     """Files of the operator's home of which the agent gets a copy."""
     resumable = False
     """Whether it resumes from `Stage.session_file` after all its processes were killed."""
+    continues = False
+    """Whether its program continues by itself from its workspace when it is started again, without a session."""
 
     def take(self, kept: Kept) -> None:
         """Gives it the run's skills and MCP servers, before it plays."""

@@ -10,17 +10,21 @@ import pytest
 from stages.agent_fakes import FakeGateway, serving
 
 from evopolicy_gateway.agents.client import Client, ProtocolError, Refusal, Verdict
-from evopolicy_gateway.agents.evolve.agent import stage_code
 
 BOX = {"type": "Box", "shape": [1], "dtype": "float32", "low": [-1.0], "high": [1.0]}
+
+POLICY = """class Policy:
+    def __init__(self, *about):
+        pass
+
+    def reset(self, episode_index):
+        pass
+"""
 
 
 def a_gateway(workspace: Path, **options: Any) -> FakeGateway:
     (workspace / "system").mkdir()
-    stage_code(workspace / "system")
-    (workspace / "system" / "candidates.json").write_text(
-        '{"candidates": [{"kind": "constant", "vector": [0.0]}], "schedule": [0]}'
-    )
+    (workspace / "system" / "policy.py").write_text(POLICY)
     return FakeGateway(
         workspace=workspace,
         obs_space=BOX,

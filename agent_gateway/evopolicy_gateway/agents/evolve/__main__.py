@@ -1,3 +1,0 @@
-from evopolicy_gateway.agents.evolve.agent import main
-
-main()
