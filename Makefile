@@ -4,6 +4,7 @@
 # make test-system  those that play many whole runs on clusters of their own
 # make test-families  those that play every family of environments
 # make test-long  both at once, which takes less time than one after the other
+# make test-root  as root, those of `make test` that need root or say something else there: sandbox, jail, attacks
 # make paper-worker  installs a worker with the paper's library versions into .venv-paper
 # make check  ruff and mypy
 # make release  builds wheel and sdist in dist/, checks them, and installs them in clean environments
@@ -22,18 +23,19 @@
 # make bench-web bench-web-live       the live view: 2,000 workers, 500 open runs, 200 browsers
 # make faults real processes killed, frozen and starved through whole runs; ARGS="--chaos 3600": several at once, at random
 # make sim    the coordinator's core under a simulated network with faults
-VENV := .venv
-BIN := $(VENV)/bin
-PIP = $(BIN)/python -m pip install -q --disable-pip-version-check
 PYTHON ?= $(shell for p in python3.13 python3.12 python3.11 python3; do \
 	$$p -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null && echo $$p && break; done)
+# A Python that is named has an installation of its own: make test PYTHON=python3.12 installs into .venv-3.12.
+VENV := .venv$(if $(filter command,$(origin PYTHON)),-$(shell $(PYTHON) -c 'import sys; print("%d.%d" % sys.version_info[:2])'))
+BIN := $(VENV)/bin
+PIP = $(BIN)/python -m pip install -q --disable-pip-version-check
 # Each stamp: an installation that includes those before it.
 CORE := $(VENV)/.core
 FAMILIES := $(VENV)/.families
 STAMP := $(VENV)/.installed
 
 .DEFAULT_GOAL := help
-.PHONY: help install families paper-worker demo test test-system test-families test-long check check-envs docs release bench bench-start bench-replay bench-peers bench-throughput bench-scale bench-channels bench-report bench-coverage bench-isolation bench-costs bench-web bench-web-live faults sim clean
+.PHONY: help install families paper-worker demo test test-root test-system test-families test-long check check-envs docs release bench bench-start bench-replay bench-peers bench-throughput bench-scale bench-channels bench-report bench-coverage bench-isolation bench-costs bench-web bench-web-live faults sim clean
 
 help:
 	@sed -n 's/^# make/make/p' Makefile
@@ -78,6 +80,7 @@ PROCESSES := $$(( $$(nproc) + 9 ))
 
 # ARGS that name files play those, of whatever layer.
 test: LAYERS = not system and not families
+test-root: LAYERS = (root or walls) and not system and not families
 test-system: LAYERS = system
 test-families: LAYERS = families
 test-long: LAYERS = system or families
@@ -85,11 +88,11 @@ test-long: LAYERS = system or families
 test-system test-long: PROCESSES = $$(( $$(nproc) + 4 ))
 # These compute most of the time, and have limits on time; browsers and clusters wait.
 test-families: PROCESSES = $$(( $$(nproc) + 2 ))
-test: HOST = --tests
+test test-root: HOST = --tests
 test-system test-families test-long: HOST = --all-tests
 # The tests start hundreds of processes: none of them shall compile our modules anew, whatever the shell asks of Python.
-test test-system test-families test-long: export PYTHONDONTWRITEBYTECODE :=
-test test-system test-families test-long: install
+test test-root test-system test-families test-long: export PYTHONDONTWRITEBYTECODE :=
+test test-root test-system test-families test-long: install
 	@bash deploy/setup-host.sh $(HOST)
 	@short="$$(mktemp -d /tmp/evp-XXXXXX)"; $(BIN)/python -m pytest --processes $(PROCESSES) --basetemp="$$short/t" \
 	$(if $(findstring tests/,$(ARGS)),,-m "$(LAYERS)") $(ARGS); status=$$?; \
@@ -178,4 +181,4 @@ sim: install
 	@test -n "$(ARGS)" || $(BIN)/python tests/simulation/scale.py
 
 clean:
-	rm -rf $(VENV) .venv-paper .mypy_cache .ruff_cache .pytest_cache .hypothesis
+	rm -rf .venv .venv-3.* .venv-paper .mypy_cache .ruff_cache .pytest_cache .hypothesis

@@ -1,23 +1,31 @@
 #!/usr/bin/env bash
-# Installs the system packages that evopolicy needs: bubblewrap, the policies' sandbox; with --tests, what `make test` uses too;
-# with --all-tests, what all layers of tests use.
-# As root on Debian or Ubuntu it installs them; otherwise it says exactly what to install and goes on.
+# Installs the system packages that evopolicy needs: bubblewrap, the sandbox of policies and agents; with --tests, also those of `make test`;
+# with --all-tests, those of all layers of tests.
+# As root on Debian or Ubuntu it installs them; otherwise it says exactly what to install, and what does not work without it, and goes on.
 set -euo pipefail
+PATH="$PATH:/usr/sbin:/sbin" # where an ordinary user of Debian has no ip and no ldconfig
 
 missing=()
-command -v bwrap >/dev/null 2>&1 || missing+=(bubblewrap)
-if [ "${1:-}" = "--tests" ] || [ "${1:-}" = "--all-tests" ]; then
-  # What only the tests use: network namespaces, a compiler for a clock that jumps, systemd's check of units, drawing
-  # without a display.
-  command -v ip >/dev/null 2>&1 || missing+=(iproute2)
-  command -v cc >/dev/null 2>&1 || missing+=(gcc libc6-dev)
-  command -v systemd-analyze >/dev/null 2>&1 || missing+=(systemd)
-  ldconfig -p 2>/dev/null | grep -q 'libEGL\.so\.1' || missing+=(libegl1 libegl-mesa0 libgl1-mesa-dri)
-fi
+losses=()
+need() { # need 'PACKAGES' 'WHAT DOES NOT WORK WITHOUT THEM' COMMAND...: the command fails where they are missing
+  "${@:3}" >/dev/null 2>&1 && return
+  read -ra packages <<<"$1"
+  missing+=("${packages[@]}")
+  losses+=("$1: $2")
+}
+has_egl() { [[ "$(ldconfig -p)" == *libEGL.so.1* ]]; }
+
+need bubblewrap "policies and agents run with --tier none --jail none only, make demo does not run, and tests fail" command -v bwrap
+case "${1:-}" in --tests | --all-tests)
+  need iproute2 "tests on several hosts are left out" command -v ip
+  need systemd "the tests of the systemd units are left out" command -v systemd-analyze
+  need "libegl1 libegl-mesa0 libgl1-mesa-dri" "MuJoCo environments have no videos, and tests of videos are left out; everything else works" has_egl
+  ;;
+esac
 if [ "${1:-}" = "--all-tests" ]; then
-  # Slurm on one node, and a browser for reports, the live view, and environments that are web pages.
-  command -v slurmctld >/dev/null 2>&1 || missing+=(slurmctld slurmd slurm-client munge)
-  command -v chromium >/dev/null 2>&1 || missing+=(chromium)
+  need "gcc libc6-dev" "the tests with bad clocks and bad disks fail" command -v cc
+  need "slurmctld slurmd slurm-client munge" "the tests on Slurm are left out" command -v slurmctld
+  need chromium "environments that are web pages do not run, and the tests in a browser are left out" command -v chromium
 fi
 [ ${#missing[@]} -eq 0 ] && exit 0
 
@@ -32,7 +40,9 @@ fi
 
 case "$(uname -s)" in
   Linux)
-    echo "note: ${missing[*]} is missing. Policies will not run in the default sandbox until it is installed:"
+    echo "note: packages are missing, and without them:"
+    printf '    %s\n' "${losses[@]}"
+    echo "To install them:"
     echo "    Debian, Ubuntu:  sudo apt-get install ${missing[*]}"
     echo "    Fedora:          sudo dnf install ${missing[*]}"
     echo "    Arch:            sudo pacman -S ${missing[*]}" ;;

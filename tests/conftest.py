@@ -9,6 +9,7 @@ import os
 import re
 import signal
 import tempfile
+from collections import Counter
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -33,6 +34,13 @@ _LEFT_OUT: dict[str, Callable[[bytes], object]] = {
 }
 """By `-m`: whether a file has no test of the layer. A file of another layer than `make test` says so in its first
 mark."""
+
+_WALLS = (
+    *(f"tests/conformance/{name}/" for name in ("cheats", "hostile")),
+    *(f"tests/unit/{name}/" for name in ("gateway/jail", "worker/runtime", "worker/slot_endings")),
+    *(f"tests/integration/{name}" for name in ("worker/", "gateway/agents/test_jailed_agents.py")),
+)
+"""Tests of sandbox and jail, which root gets in another way than an ordinary user: marked `walls`."""
 
 _ONE_BY_ONE = (
     *(f"tests/families/test_{name}.py::" for name in ("proof_of_life", "parity", "cited_policies")),
@@ -90,11 +98,18 @@ def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool 
 
 @pytest.hookimpl(tryfirst=True)  # before -m selects by marker
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Puts files with slow tests first, unit tests last, others in the order of their paths.
+    """Marks tests of walls, skips what needs root, and puts files with slow tests first, unit tests last, others in
+    the order of their paths.
 
     Processes take files in this order, so that they end at about the same time. There unit tests, which compute, stand
     among the others, which wait for processes and clusters.
     """
+    for item in items:
+        if item.nodeid.startswith(_WALLS):
+            item.add_marker("walls")
+        if os.geteuid() != 0 and item.get_closest_marker("root") is not None:
+            layer = "test-long" if item.get_closest_marker("system") is not None else "test-root"
+            item.add_marker(pytest.mark.skip(f"needs root: make {layer} as root"))
     files = list(dict.fromkeys(item.path for item in items))
     slow = {item.path for item in items if item.get_closest_marker("slow") is not None}
     unit = {path for path in files if path.is_relative_to(Path(__file__).parent / "unit")}
@@ -158,6 +173,17 @@ def _state_of_its_own() -> Iterator[None]:
     with tempfile.TemporaryDirectory(prefix="evp-state-", ignore_cleanup_errors=True) as folder:
         os.environ["XDG_STATE_HOME"] = folder
         yield
+
+
+def pytest_unconfigure(config: pytest.Config) -> None:
+    """The last line: how many tests were left out, and why."""
+    reporter = config.pluginmanager.getplugin("terminalreporter")
+    if reporter is None or not (skipped := reporter.stats.get("skipped", [])):
+        return
+    reasons = Counter(str(report.longrepr[2]).removeprefix("Skipped: ") for report in skipped)
+    reporter.write_line(
+        f"left out: {len(skipped)} ({'; '.join(f'{n}: {reason}' for reason, n in reasons.most_common())})"
+    )
 
 
 def pytest_configure(config: pytest.Config) -> None:

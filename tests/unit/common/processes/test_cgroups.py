@@ -20,7 +20,6 @@ UNIFIED = next(
     (each for each in (cgroups.ROOT, cgroups.ROOT / "unified") if (each / "cgroup.controllers").exists()),
     None,
 )
-needs_root = pytest.mark.skipif(os.getuid() != 0, reason="only root makes cgroups of a test's own")
 
 
 @pytest.fixture
@@ -55,7 +54,7 @@ def test_a_program_whose_cgroup_is_gone_does_not_start(tmp_path: Path) -> None:
     assert (done.returncode, done.stdout) == (1, b"")
 
 
-@needs_root
+@pytest.mark.root
 @pytest.mark.skipif(UNIFIED is None, reason="this machine has no cgroups of version 2")
 @pytest.mark.parametrize("delegated", [True, False])
 def test_a_user_gets_groups_only_in_a_delegated_one(delegated: bool) -> None:

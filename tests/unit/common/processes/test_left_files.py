@@ -118,7 +118,7 @@ def test_access_lists_and_capabilities_are_taken_from_files(tmp_path: Path) -> N
         assert not {"system.posix_acl_default", "security.capability"} & {*os.listxattr(path)}
 
 
-@pytest.mark.skipif(os.geteuid() != 0, reason="only root may give files to other users")
+@pytest.mark.root  # only root may give files to other users
 def test_files_of_other_owners_become_the_folders_owners(tmp_path: Path) -> None:
     (tmp_path / "folder").mkdir()
     (tmp_path / "folder" / "theirs").touch()

@@ -35,7 +35,7 @@ def workspace() -> Iterator[Path]:
     shutil.rmtree(folder)
 
 
-@pytest.mark.skipif(os.getuid() != 0, reason="needs files of two users: run it as root")
+@pytest.mark.root  # files of two users
 def test_folders_of_a_containers_root_are_named_with_the_remedy(workspace: Path) -> None:
     """Python in a container writes `__pycache__` as root."""
     system = workspace / "system"
