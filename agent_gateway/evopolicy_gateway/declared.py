@@ -10,21 +10,25 @@ heading.
 from __future__ import annotations
 
 import ast
+import difflib
 import functools
 import inspect
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Literal, NamedTuple, get_args, get_origin, get_type_hints
 
 import msgspec
 from msgspec import Meta
+
+from evopolicy_common.errors import ConfigError
 
 Several = list[str] | None
 """An option that may be repeated."""
 Count = Annotated[int, Meta(ge=1)]
 SAME = object()
 """A surface has the field's own type."""
+SET = "--set"
 
 
 class Option(msgspec.Struct, frozen=True, kw_only=True):
@@ -32,6 +36,8 @@ class Option(msgspec.Struct, frozen=True, kw_only=True):
 
     flag: str | None = None
     """On the command line, if it is not named as the field."""
+    by_set: bool = False
+    """The command line takes it as `--set NAME=VALUE`: a setting that few runs change."""
     metavar: str | None = None
     command: Any = SAME
     """Type on the command line."""
@@ -60,6 +66,13 @@ class Declared(NamedTuple):
     group: str
     option: Option
 
+    @property
+    def flag(self) -> str:
+        """How the command line spells it."""
+        if self.option.by_set:
+            return f"{SET} {self.name}=…"
+        return self.option.flag or f"--{self.name.replace('_', '-')}"
+
 
 @functools.cache
 def declared(options: type[msgspec.Struct]) -> dict[str, Declared]:
@@ -87,6 +100,40 @@ def _notes(kind: Any) -> list[Any]:
     if get_origin(kind) is Annotated:
         return [*kind.__metadata__, *_notes(kind.__origin__)]
     return [note for each in get_args(kind) if get_origin(each) is Annotated for note in _notes(each)]
+
+
+def set_values(known: Mapping[str, Declared], texts: Sequence[str]) -> dict[str, Any]:
+    """The values of `NAME=VALUE` texts, of those options that have no flag. ConfigError for another name or an
+    impossible value."""
+    known = {name: one for name, one in known.items() if one.option.by_set}
+    values: dict[str, Any] = {}
+    for text in texts:
+        name, equals, value = text.partition("=")
+        one = known.get(name.strip().replace("-", "_"))
+        if one is None or not equals:
+            near = difflib.get_close_matches(name, known, 1)
+            meant = f"did you mean {near[0]}=…? " if near else ""
+            raise ConfigError(
+                f"{SET} {text}: {meant}write NAME=VALUE with one of: {', '.join(sorted(known))}"
+            )
+        try:
+            values[one.name] = msgspec.convert(value.strip(), one.bounded, strict=False, dec_hook=_path)
+        except msgspec.ValidationError as error:
+            allowed = [repr(each) for part in (one.type, *get_args(one.type)) for each in literals(part)]
+            reason = f"use one of {', '.join(allowed)}" if allowed else error
+            raise ConfigError(f"{SET} {text}: {reason}. {one.help}") from None
+    return values
+
+
+def literals(kind: Any) -> tuple[Any, ...]:
+    """The values of a Literal; none of another type."""
+    return get_args(kind) if get_origin(kind) is Literal else ()
+
+
+def _path(kind: type, value: Any) -> Any:
+    if kind is Path:
+        return Path(value)
+    raise NotImplementedError(kind)
 
 
 def suite_keys(options: type[msgspec.Struct]) -> list[tuple[str, Any, None]]:

@@ -229,7 +229,7 @@ class SplitSource:
             return EnvironmentSplits(env=env, secret=True, epoch=epoch_of(self._secret), files={}, **cases)
         if own:
             raise ConfigError(
-                "--hidden-cases per-run needs cases that are derived from the coordinator's secret; this one takes"
+                "--set hidden_cases=per-run needs cases that are derived from the coordinator's secret; this one takes"
                 f" them from {self._data}, so all runs share them"
             )
         folder = folder_of(self._data, env)

@@ -31,8 +31,7 @@ def page() -> Iterator[str]:
             if name in JailSettings.__struct_fields__:
                 suite = f"`jail.{name}`"
             python = f"`{name}`" if everywhere and one.option.python else ""
-            flag = one.option.flag or f"--{name.replace('_', '-')}"
-            yield f"| `{flag}` | {suite} | {python} | {_default(one.default)} | {one.help} |"
+            yield f"| `{one.flag}` | {suite} | {python} | {_default(one.default)} | {one.help} |"
 
 
 def _default(value: Any) -> str:

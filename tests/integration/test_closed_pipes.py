@@ -9,7 +9,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from commands import SMALL
+from commands import SMALL, STILL
 from documents import commands
 from forked import Forks
 from waiting import wait_until
@@ -63,7 +63,7 @@ def test_results_that_nobody_reads_end_their_commands_quietly(tmp_path: Path) ->
         "evopolicy data check splits",
         "evopolicy-coordinator certs issue worker gpu-7 --state state --out issued",
         "evopolicy-coordinator certs list --state state",
-        "evopolicy random --env toy/line --cases 0,1 --fresh",
+        f"evopolicy try {STILL} --env toy/line --cases 0,1 --fresh",
     ):
         assert closed(*command.split(), cwd=tmp_path) == (READER_GONE, ""), command
 

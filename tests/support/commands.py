@@ -255,6 +255,10 @@ def played_here(
         return record_in(run_dir(cwd)), running.text
 
 
+STILL = str(Path(__file__).with_name("still"))
+"""Folder of a policy that returns zeros."""
+
+
 def run_dir(cwd: Path, env: str = "toy_line", exp_id: str = "t") -> Path:
     """The one run directory of that name."""
     (found,) = (cwd / "runs").glob(f"*/{env}/{exp_id}")

@@ -63,7 +63,6 @@ SEVERAL_LINES = {("evopolicy local", "agent"), ("evopolicy run", "agent")}
 BASES = {
     "evopolicy demo": ["--runs=played"],
     "evopolicy try": ["{policy_dir}", "--env=toy/line", "--state=new"],
-    "evopolicy random": ["--env=toy/line", "--state=new"],
     "evopolicy local": [
         "--env=toy/line",
         "--agent=random",

@@ -10,6 +10,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from commands import STILL
 from documents import APPS, commands
 from forked import BIN, Forks
 from invented.run_dirs import write_run
@@ -155,8 +156,8 @@ LOCAL = ["evopolicy", "local", "--env", "toy", "--agent"]
         ([*LOCAL, "random", "--slots", "1_000"], "'--slots': '1_000' is not a finite number in digits"),
         ([*LOCAL, "random", "--budget", "20001"], "a budget of 20,001 episodes; 20,000 are the limit"),
         (
-            ["evopolicy", "random", "--env", "toy/line", "--cases", "0,32"],
-            "no heldout case 32; the cases are 0 to 31",
+            ["evopolicy", "try", STILL, "--env", "toy/line", "--cases", "0,64"],
+            "no train case 64; the cases are 0 to 63",
         ),
         (["evopolicy", "gc", "--older-than", "inf"], "'inf' is not a finite number in digits"),
         (["evopolicy", "diff", "EMPTY", "RUNS"], "EMPTY is no run directory: it has neither run.json nor"),
@@ -233,7 +234,7 @@ def test_a_mistyped_command_is_answered_with_the_nearest(forked: Forks) -> None:
         ("starlette,uvicorn,h11", ["evopolicy", "local", "--env", "toy", "--agent", "evolve"], "local"),
         ("starlette,uvicorn,h11", ["evopolicy", "demo"], "local"),
         ("cryptography", ["evopolicy", "demo"], "local"),
-        ("cryptography", ["evopolicy", "random", "--env", "toy/line"], "local"),
+        ("cryptography", ["evopolicy", "try", STILL, "--env", "toy/line"], "local"),
         ("starlette,uvicorn,h11", ["evopolicy", "web"], "coordinator"),
         ("starlette,uvicorn,h11", ["evopolicy", "suite", "smoke.toml", "--local"], "gateway"),
         ("cryptography", ["evopolicy-coordinator"], "coordinator"),

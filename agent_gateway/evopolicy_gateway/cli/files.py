@@ -1,11 +1,14 @@
-"""`evopolicy files`, `texts` and `schema`: what comes with the package besides code."""
+"""`evopolicy files`: what comes with the package besides code, and the files that it can write."""
 
 from __future__ import annotations
 
 import shutil
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
+import msgspec
 import typer
 
 from evopolicy_common.cli.conventions import fail_on_our_errors
@@ -26,15 +29,24 @@ def files(
     ] = "",
     to: Annotated[Path | None, typer.Option(help="Copy the files into this folder.")] = None,
 ) -> None:
-    """List or copy the examples, deployment files and pages that come with evopolicy.
+    """List, print or copy the examples, deployment files, standard texts, schemas and pages that come with evopolicy.
 
     Commands find these files under the names in the documentation, unless the current folder has a file of that name.
+    texts/ has the standard texts of agents, templates for the settings agents_md and prompts; schemas/ has the JSON
+    Schema of each file.
     """
     with fail_on_our_errors():
         wanted = name.rstrip("/")
+        if wanted in (made := _made()) and to is None:
+            if wanted.startswith("schemas/"):
+                say_json(msgspec.json.decode(made[wanted]()))
+            else:
+                say_lines(made[wanted]().splitlines())
+            return
+        everything = [*shipped.files(), *made.items()]
         chosen = [
             (each, place)
-            for each, place in shipped.files()
+            for each, place in everything
             if not wanted or each == wanted or each.startswith(f"{wanted}/")
         ]
         if not chosen:
@@ -49,34 +61,23 @@ def files(
             raise ConfigError(f"{there[0]} already exists; choose another folder with --to")
         for target, (_, place) in zip(targets, chosen, strict=True):
             target.parent.mkdir(parents=True, exist_ok=True)
-            shutil.copyfile(place, target)
+            if isinstance(place, Path):
+                shutil.copyfile(place, target)
+            else:
+                target.write_text(place(), encoding="utf-8")
         say_lines([f"{len(chosen)} files copied to {to}"])
 
 
-@app.command("texts", epilog="Example: evopolicy texts prompts > prompts.toml")
-def texts(
-    which: Annotated[
-        Literal["agents-md", "prompts"],
-        typer.Argument(help="The option that the text is for.", show_default=False),
-    ],
-) -> None:
-    """Print the standard texts for agents, as templates for --agents-md and --prompts."""
-    if which == "agents-md":
-        say_lines(agents_md.STANDARD.splitlines())
-        return
-    for name, text in prompts.STANDARD.items():
-        say_lines([f'{name} = """\\', f'{text}"""'])
+def _made() -> dict[str, Callable[[], str]]:
+    """The files that are written on demand, by name."""
+    texts: dict[str, Callable[[], str]] = {
+        "texts/agents.md": lambda: agents_md.STANDARD,
+        "texts/prompts.toml": lambda: (
+            "\n".join(f'{name} = """\\\n{text}"""' for name, text in prompts.STANDARD.items()) + "\n"
+        ),
+    }
+    return texts | {f"schemas/{name}.schema.json": partial(_schema, name) for name in schemas.KINDS}
 
 
-@app.command("schema", epilog="Example: evopolicy schema suite.toml > suite.schema.json")
-def schema(
-    name: Annotated[
-        str, typer.Argument(help="Name of the file, such as run.json; default: list the names.")
-    ] = "",
-) -> None:
-    """Print the JSON Schema of one of evopolicy's files."""
-    with fail_on_our_errors():
-        if not name:
-            say_lines([f"{each:<14}{kind.about}" for each, kind in schemas.KINDS.items()])
-            return
-        say_json(schemas.schema(name))
+def _schema(name: str) -> str:
+    return msgspec.json.format(msgspec.json.encode(schemas.schema(name)), indent=2).decode() + "\n"

@@ -35,7 +35,7 @@ _MODULES = {
     "evopolicy_coordinator.cli.gc:disk_app": "disk",
     "evopolicy_coordinator.cli.gc:gc_app": "gc",
     "evopolicy_worker.doctor:app": "doctor",
-    "evopolicy_gateway.cli.files:app": "files texts schema",
+    "evopolicy_gateway.cli.files:app": "files",
     "evopolicy_coordinator.cli.data:app": "data",
 }
 """Each `module:name` of a `typer.Typer`, which holds the named commands or is one."""
@@ -46,7 +46,6 @@ GROUPS = {
         "demo": "Play one run on this machine: the agent evolve on gym/continuouscar, 32 episodes.",
         "replay": "Play a recorded run again: the same agent, with its model's answers from the record.",
         "try": "Play a policy on train cases, without a run or an agent.",
-        "random": "Play uniform random actions on a split, as a reference for scores.",
         "local": "Play runs on this machine.",
         "run": "Play one run on a cluster.",
         "finish": "Close the run of a remote agent.",
@@ -79,9 +78,8 @@ GROUPS = {
     },
     "Setup and files": {
         "doctor": "Check this machine, and print the remedy for each missing part.",
-        "files": "List or copy the examples, deployment files and pages that come with evopolicy.",
-        "texts": "Print the standard texts for agents, as templates for --agents-md and --prompts.",
-        "schema": "Print the JSON Schema of one of evopolicy's files.",
+        "files": "List, print or copy the examples, deployment files, standard texts, schemas and pages that come"
+        " with evopolicy.",
         "data": "Make and check the split files of environments (hidden cases: keep them from agents).",
     },
 }

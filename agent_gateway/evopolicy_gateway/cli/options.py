@@ -7,7 +7,7 @@ as `Annotated[type, Of(Struct)]`.
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple, get_args, get_origin
 
@@ -18,7 +18,7 @@ from evopolicy_common.cli.conventions import fail_on_our_errors
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.processes.packages import checked_names
 from evopolicy_common.wire.credentials import local_state_dir
-from evopolicy_gateway.declared import SAME, Declared, Several, declared
+from evopolicy_gateway.declared import SAME, SET, Declared, Several, declared, set_values
 from evopolicy_gateway.operator.cluster import Cluster
 from evopolicy_gateway.run.run_options import ClusterOptions
 
@@ -108,6 +108,8 @@ def spread(command: Callable[..., None]) -> Callable[..., None]:
     parameters: list[inspect.Parameter] = []
     groups: dict[str, tuple[Any, list[str]]] = {}
     parsed: dict[str, Callable[[Any], Any]] = {}
+    rare: dict[str, Declared] = {}
+    fields_of: dict[str, list[str]] = {}
     for each in inspect.signature(command, eval_str=True).parameters.values():
         kind, note = each.annotation, None
         if get_origin(kind) is Annotated:
@@ -116,20 +118,29 @@ def spread(command: Callable[..., None]) -> Callable[..., None]:
             options, shown = [declared(note.options)[each.name]], Shown()
         elif inspect.isclass(kind) and issubclass(kind, msgspec.Struct):
             shown = note or Shown()
-            options = [one for one in declared(kind).values() if one.name not in shown.without]
+            chosen = [one for one in declared(kind).values() if one.name not in shown.without]
+            options = [one for one in chosen if not one.option.by_set]
             groups[each.name] = (kind, [one.name for one in options])
+            rare |= {one.name: one for one in chosen if one.option.by_set}
+            fields_of[each.name] = [one.name for one in chosen if one.option.by_set]
         else:
             parameters.append(each.replace(kind=inspect.Parameter.KEYWORD_ONLY))
             continue
         parameters += [_parameter(one, shown.help.get(one.name, one.help)) for one in options]
         parsed |= {one.name: one.option.parse for one in options if one.option.parse is not None}
 
+    if rare:
+        parameters.append(_set_parameter(list(rare)))
+
     def flat(**values: Any) -> None:
         with fail_on_our_errors():
+            further = set_values(rare, values.pop("set_", None) or ())
             for name, parse in parsed.items():
                 values[name] = parse(values[name] or ())
             for name, (group, fields) in groups.items():
-                values[name] = group(**{field: values.pop(field) for field in fields})
+                given = {field: values.pop(field) for field in fields}
+                set_here = {field: further[field] for field in fields_of[name] if field in further}
+                values[name] = group(**given, **set_here)
             command(**values)
 
     flat.__name__, flat.__doc__ = command.__name__, command.__doc__
@@ -138,12 +149,20 @@ def spread(command: Callable[..., None]) -> Callable[..., None]:
     return flat
 
 
+def _set_parameter(names: Sequence[str]) -> inspect.Parameter:
+    text = f"A further setting (docs/reference/options.md): {', '.join(names)}; may be repeated."
+    shown = typer.Option(SET, metavar="NAME=VALUE", help=text, show_default=False, rich_help_panel=RUN)
+    return inspect.Parameter(
+        "set_", inspect.Parameter.KEYWORD_ONLY, default=None, annotation=Annotated[Several, shown]
+    )
+
+
 def _parameter(one: Declared, text: str) -> inspect.Parameter:
     option = one.option
     kind = one.type if option.command is SAME else option.command
     default = inspect.Parameter.empty if one.default is msgspec.NODEFAULT else one.default
     shown = typer.Option(
-        option.flag or f"--{one.name.replace('_', '-')}",
+        one.flag,
         min=one.bounds.ge,
         max=one.bounds.le,
         metavar=option.metavar,

@@ -1,4 +1,4 @@
-"""`evopolicy run`, `local`, `try`, `random`, `diff` and `finish`: commands that play or compare runs and episodes."""
+"""`evopolicy run`, `local`, `try`, `diff` and `finish`: commands that play or compare runs and episodes."""
 
 from __future__ import annotations
 
@@ -13,7 +13,6 @@ from evopolicy_common.cli.conventions import Connect, CredentialsFile, fail, fai
 from evopolicy_common.cli.frame import App
 from evopolicy_common.console import terminal
 from evopolicy_common.errors import ConfigError
-from evopolicy_common.messages.environment import Split
 from evopolicy_common.messages.episode import ResourceLimits, Tier
 from evopolicy_common.processes.preflight import LOCAL, check_installed
 from evopolicy_common.records.run_difference import differences, left_out, shortened
@@ -166,31 +165,6 @@ def try_policy(
     where.check_ids([env_id], "train", ids)
     given: dict[str, Any] = {"sandbox_tier": tier, "limits": limits, "as_json": as_json}
     raise typer.Exit(run_to_end(trials.try_policy(env_id, policy, ids, out, where, **given)))
-
-
-@app.command("random", epilog="Example: evopolicy random --env gym/acrobot --split heldout")
-@spread
-def play_random(
-    *,
-    env: options.Envs,
-    split: Annotated[Split, typer.Option(help="Cases to play.")] = "heldout",
-    cases: Annotated[str | None, typer.Option(help="Ids and ranges in the split; default: all.")] = None,
-    connect: Connect = None,
-    credentials_file: CredentialsFile = None,
-    cluster: Annotated[ClusterOptions, _UNAUDITED],
-    as_json: options.Json = False,
-) -> None:
-    """Play uniform random actions on a split, as a reference for scores.
-
-    Starts a local cluster unless --connect or --credentials name one.
-    """
-    from evopolicy_gateway.operator import trials
-
-    chosen = None if cases is None else cases_of(cases)
-    where = options.cluster_of(cluster, connect, credentials_file)
-    env_ids = catalogue.resolve(env)
-    where.check_ids(env_ids, split, chosen or ())
-    raise typer.Exit(run_to_end(trials.play_random(env_ids, split, chosen, where, as_json=as_json)))
 
 
 def _tell_left_out(wanted: bool) -> None:

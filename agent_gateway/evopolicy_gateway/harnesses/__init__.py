@@ -152,7 +152,7 @@ def _cli_agent(config: AgentConfig, started_in: Path) -> CliAgent:
     # Not in `check`: the operator's option may give the prices that an agent's file lacks.
     if config.max_cost is not None and config.prices is None:
         raise ConfigError(
-            "max_cost needs prices in US dollars per million tokens: give a file with --prices, or write"
+            "max_cost needs prices in US dollars per million tokens: give a file with --set prices=FILE.toml, or write"
             " prices = { input = 1.0, output = 10.0 } beside it"
         )
     if config.program:

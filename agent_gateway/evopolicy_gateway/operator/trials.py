@@ -1,4 +1,4 @@
-"""Plays cases outside any run: `evopolicy try` and `evopolicy random`."""
+"""Plays cases outside any run: `evopolicy try`."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from evopolicy_common.console import Terminal, table, terminal
 from evopolicy_common.errors import BundleError, ConfigError
 from evopolicy_common.local.cluster import unless_failed
 from evopolicy_common.messages.environment import Split
-from evopolicy_common.messages.episode import EpisodeOutcome, Tier
+from evopolicy_common.messages.episode import EpisodeOutcome
 from evopolicy_common.messages.operator import Evaluate
 from evopolicy_common.processes.notices import Waiting
 from evopolicy_common.processes.preflight import check_writable
@@ -115,25 +115,6 @@ async def try_policy(
     for note in filter(None, notes):
         say(f"note: {note}", err=True)
     return int(any(episode.failure for episode in result.episodes))
-
-
-async def play_random(
-    env_ids: Sequence[str], split: Split, cases: Sequence[int] | None, where: Cluster, *, as_json: bool
-) -> int:
-    """Plays uniform random actions and prints the returns."""
-    console = terminal(stderr=as_json)
-    # Without a policy no sandbox is needed, but a worker of another cluster may not offer the tier `none`.
-    tier: Tier = "bwrap" if where.local is None else "none"
-
-    async def work(operations: Operations) -> list[TrialResult]:
-        more: dict[str, Any] = {"record": "actions", "sandbox_tier": tier}
-        messages = [evaluation(env_id, None, split, cases, **more) for env_id in env_ids]
-        return [await _result(message, where, operations, console) for message in messages]
-
-    async with connected(where, env_ids, {"none"}) as (operations, _, failed):
-        results = await unless_failed(asyncio.create_task(work(operations)), failed)
-    _print(results, as_json, console)
-    return 0
 
 
 async def _outcomes(operations: Operations, message: Evaluate, console: Terminal) -> list[EpisodeOutcome]:

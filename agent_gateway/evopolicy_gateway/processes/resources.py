@@ -98,11 +98,11 @@ class Resources:
         parts = []
         if now.ended_for_memory and limits.memory_bytes:
             parts.append(
-                f"its memory limit of {limits.memory_bytes:,} bytes (--agent-memory): the kernel has ended"
+                f"its memory limit of {limits.memory_bytes:,} bytes (agent_memory): the kernel has ended"
                 f" {now.ended_for_memory} of its processes"
             )
         if now.refused_forks and limits.pids:
-            parts.append(f"its limit of {limits.pids:,} processes (--agent-pids)")
+            parts.append(f"its limit of {limits.pids:,} processes (agent_pids)")
         return "the agent reached " + ", and ".join(parts) if parts else ""
 
     async def too_large(self) -> str:
@@ -127,7 +127,7 @@ class Resources:
             return f"its folders are nested deeper than {MAX_DEPTH}, so that their size is unknown"
         self._now = msgspec.structs.replace(self._now, disk_bytes=max(self._now.disk_bytes, n_bytes))
         most = self._asked.disk_bytes
-        taken = f"its files take {n_bytes:,} bytes; {most:,} are allowed (--agent-disk)"
+        taken = f"its files take {n_bytes:,} bytes; {most:,} are allowed (agent_disk)"
         return taken if n_bytes > most else ""
 
 

@@ -182,7 +182,7 @@ class Plan(msgspec.Struct, frozen=True, kw_only=True):
             check_loopback()
         elif self.limits != AgentLimits():
             raise ConfigError(
-                "--agent-cpus, --agent-memory, --agent-pids and --agent-disk limit an agent that is started here;"
+                "agent_cpus, agent_memory, agent_pids and agent_disk limit an agent that is started here;"
                 " leave them out"
             )
         self.harness().check(self.settings.env)

@@ -110,6 +110,7 @@ def packages_for(policy: Path, requested: Sequence[str] | None) -> tuple[str, ..
 
 Seconds = Annotated[float, Meta(ge=1.0)]
 OF_ONE_RUN = Option(suite=None)
+RARE = Option(by_set=True)
 AGENT_LIMITS: dict[str, tuple[str, float, float]] = {
     "cpus": ("cpus", 0.1, 1e4),
     "memory": ("memory_bytes", 1e8, 1e15),
@@ -153,9 +154,9 @@ class RunPart(msgspec.Struct, frozen=True, kw_only=True):
     """Continue the run with this --exp-id after its command was killed."""
     entry: Annotated[str | None, OF_ONE_RUN] = None
     """Name of the leaderboard entry; default: the agent's."""
-    model: Annotated[str | None, OF_ONE_RUN] = None
+    model: Annotated[str | None, Option(suite=None, by_set=True)] = None
     """Name of the model behind the agent; default: the entry's."""
-    repeat: Annotated[int, Meta(ge=0), OF_ONE_RUN] = 0
+    repeat: Annotated[int, Meta(ge=0), Option(suite=None, by_set=True)] = 0
     """Number of this repeat of the same agent and environment."""
 
 
@@ -166,27 +167,27 @@ class ScorePart(RunPart, frozen=True, kw_only=True):
     """Hidden validation cases."""
     heldout: Count | None = None
     """Hidden held-out cases."""
-    hidden_cases: Literal["shared", "per-run"] | None = None
+    hidden_cases: Annotated[Literal["shared", "per-run"] | None, RARE] = None
     """shared: the same for all runs of an environment (default); per-run: the run's own, so that runs cannot be
     paired."""
-    replays: VideoOption | None = None
+    replays: Annotated[VideoOption | None, RARE] = None
     """Videos of the held-out episodes; default: as --video."""
 
 
 class PolicyPart(ScorePart, frozen=True, kw_only=True):
     group: ClassVar[str] = "Policy and feedback"
 
-    min_episodes: Count | None = None
+    min_episodes: Annotated[Count | None, RARE] = None
     """Least number of episodes in a submit."""
-    max_episodes: Count | None = None
+    max_episodes: Annotated[Count | None, RARE] = None
     """Greatest number of episodes in a submit."""
-    policy_scope: PolicyScope | None = None
+    policy_scope: Annotated[PolicyScope | None, RARE] = None
     """episode: a new Policy object for each episode (default); submit: one for all episodes of a submit."""
-    observations: ObservationForm | None = None
+    observations: Annotated[ObservationForm | None, RARE] = None
     """Form of observations: arrays (default), or lists as published."""
-    step_limit: StepLimit | None = None
+    step_limit: Annotated[StepLimit | None, RARE] = None
     """published: the step limits of the published software (default); natural: those of the environment."""
-    failed_episodes: FailedEpisodes | None = None
+    failed_episodes: Annotated[FailedEpisodes | None, RARE] = None
     """An episode in which the policy fails: play-on with random actions (default), or end-submit, as published: it
     ends, and the submit is not eligible."""
     tier: Tier = "bwrap"
@@ -200,7 +201,7 @@ class PolicyPart(ScorePart, frozen=True, kw_only=True):
     """Limit for the policy, such as act_wall_s=5 or memory_bytes=2e9."""
     video: VideoOption = "off"
     """Videos in the feedback."""
-    feedback: FeedbackDetail | None = None
+    feedback: Annotated[FeedbackDetail | None, RARE] = None
     """Feedback to the agent: scores, trajectories as well, or also pictures and videos (default)."""
 
 
@@ -212,31 +213,31 @@ class RunOptions(PolicyPart, frozen=True, kw_only=True):
     start_from: Annotated[str | None, Option(metavar="RUN@submit_NNN", suite=str)] = None
     """Start with the workspace as it was at that submit of an earlier run of this cluster, and its feedback below
     history/. The run has a full budget of its own."""
-    agents_md: Annotated[Path | None, Option(metavar="FILE")] = None
-    """Replacement for AGENTS.md; `evopolicy texts` prints the standard one."""
-    prompts: Annotated[Path | None, Option(metavar="FILE.toml")] = None
-    """Replacements for prompts; `evopolicy texts` prints the standard ones."""
-    prices: Annotated[Path | None, Option(metavar="FILE.toml")] = None
+    agents_md: Annotated[Path | None, RARE] = None
+    """Replacement for AGENTS.md; `evopolicy files texts/agents.md` prints the standard one."""
+    prompts: Annotated[Path | None, RARE] = None
+    """Replacements for prompts; `evopolicy files texts/prompts.toml` prints the standard ones."""
+    prices: Annotated[Path | None, RARE] = None
     """Prices by model, in US dollars per million tokens: the run's cost is recorded, and `max_cost` limits it."""
-    simulation: SimulationRule | None = None
+    simulation: Annotated[SimulationRule | None, RARE] = None
     """Whether AGENTS.md allows the agent to simulate the environment itself; default: forbidden."""
-    finish: FinishRule | None = None
+    finish: Annotated[FinishRule | None, RARE] = None
     """early: the agent may stop before it has spent its budget (default); budget: that is an error, as published."""
     record_model: Level = "digests"
     """Record of the calls of the agent's model, below logs/model/: off, digests, or full, which `evopolicy replay`
     needs. For agents whose model is reached with a key."""
     agent_wall_s: Annotated[Seconds, Option(suite=Annotated[float, Meta(gt=0)])] = WALL_S
     """Time limit for the agent, in seconds."""
-    agent_silence_s: Annotated[Seconds, Option(suite=Annotated[float, Meta(gt=0)])] = SILENCE_S
+    agent_silence_s: Annotated[Seconds, Option(suite=Annotated[float, Meta(gt=0)], by_set=True)] = SILENCE_S
     """End an agent that submits nothing, changes no file and uses no processor time for this long, in seconds."""
 
-    agent_cpus: float | None = None
+    agent_cpus: Annotated[float | None, RARE] = None
     """Processor time for the agent's programs, in cores."""
-    agent_memory: float | None = None
+    agent_memory: Annotated[float | None, RARE] = None
     """Memory for the agent's programs, in bytes, such as 8e9."""
-    agent_pids: int | None = None
+    agent_pids: Annotated[int | None, RARE] = None
     """Greatest number of the agent's processes and threads."""
-    agent_disk: float | None = None
+    agent_disk: Annotated[float | None, RARE] = None
     """Space for the agent's workspace, home, and /tmp, in bytes: with more, it is ended. Default: 2e10."""
 
     def texts(self, started_in: Path, config: AgentConfig | None = None) -> Texts:

@@ -59,16 +59,16 @@ def read_prices(file: str | Path | None, config: AgentConfig | None, started_in:
         return None
     path = shipped.found(file, started_in)
     try:
-        tables = msgspec.toml.decode(read_given(path, f"--prices {path}"), type=dict[str, Prices])
+        tables = msgspec.toml.decode(read_given(path, f"--set prices={path}"), type=dict[str, Prices])
     except (msgspec.DecodeError, UnicodeDecodeError) as error:
-        raise ConfigError(f"--prices {path}: {error}") from error
+        raise ConfigError(f"--set prices={path}: {error}") from error
     if config.model is None:
         raise ConfigError(
-            f"--prices {path}: the agent's model is not named; write it as in codex:gpt-5.5, or in its file"
+            f"--set prices={path}: the agent's model is not named; write it as in codex:gpt-5.5, or in its file"
         )
     if config.model not in tables:
         raise ConfigError(
-            f'--prices {path} has no prices for {config.model}: add a table ["{config.model}"] with input and'
+            f'--set prices={path} has no prices for {config.model}: add a table ["{config.model}"] with input and'
             " output, in US dollars per million tokens"
         )
     return tables[config.model]

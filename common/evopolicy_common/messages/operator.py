@@ -172,7 +172,7 @@ class PlayedAs(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Evaluate(FromOperator, frozen=True, kw_only=True, tag="evaluate"):
-    """Play cases outside any run: `evopolicy try`, `evopolicy random`."""
+    """Play cases outside any run: `evopolicy try`."""
 
     key: Word
     env: Word

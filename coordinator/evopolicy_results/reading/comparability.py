@@ -126,7 +126,7 @@ _BY_SUITE = {
     "finish rule": _dimension("finish", "finish"),
     "feedback detail": _dimension("feedback", "feedback"),
     "text of AGENTS.md": _Setting(
-        lambda run: _short(run.record.experiment_dimensions.agents_md) or "standard", "the same --agents-md"
+        lambda run: _short(run.record.experiment_dimensions.agents_md) or "standard", "the same agents_md"
     ),
     "failed episodes": _dimension("failed_episodes", "failed-episodes"),
     "hidden evaluation": _dimension("hidden_evaluation", "profile"),
@@ -144,15 +144,14 @@ _BY_SUITE = {
     ),
     "agent limits": _Setting(
         lambda run: _limits(run.record.agent.resources),
-        "the same --agent-cpus, --agent-memory, --agent-pids, and --agent-disk, on machines that can keep"
-        " them",
+        "the same agent_cpus, agent_memory, agent_pids, and agent_disk, on machines that can keep them",
         lambda run: run.record.agent.resources is not None,
     ),
 }
 _BY_ENTRY = {
     "prompts": _Setting(
         lambda run: _short(run.record.agent.prompts) or "standard",
-        "the same --prompts, or another --entry for each",
+        "the same prompts, or another --entry for each",
     ),
     "skills and MCP servers": _Setting(
         lambda run: inputs_digest(run.record.agent.inputs)[:12],
@@ -164,9 +163,9 @@ _BY_ENVIRONMENT = {
     "validation split": _split("validation"),
     "held-out split": _split("heldout"),
     "environment version": _Setting(lambda run: run.record.versions.env),
-    "episodes a submit": _Setting(lambda run: run.submit_size, "the same --min-episodes and --max-episodes"),
+    "episodes a submit": _Setting(lambda run: run.submit_size, "the same min_episodes and max_episodes"),
     "policy limits": _Setting(lambda run: _limits(run.record.experiment_dimensions), "the same --limit"),
-    "step limit": _Setting(_step_limit, "the same --step-limit"),
+    "step limit": _Setting(_step_limit, "the same step_limit"),
     "videos in feedback": _dimension("video", "video"),
 }
 REMEDIES = {

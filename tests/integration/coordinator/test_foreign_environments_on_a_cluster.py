@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from commands import STILL
 from coordinator_harness import Coordinator
 
 pytestmark = pytest.mark.system
@@ -88,18 +89,18 @@ def test_an_environment_of_the_workers_alone_goes_from_announcement_to_report(
     assert listed["acme/glider"]["accepted"] == "by digest only"
     digest = str(listed["acme/glider"]["digest"])
 
-    refused = operator.says("random", "--env", "acme/glider", "--cases", "0,1")
+    refused = operator.says("try", STILL, "--env", "acme/glider", "--cases", "0,1")
     assert refused.returncode == 2
     assert f"evopolicy envs approve acme/glider@{digest}" in refused.stderr
-    near = operator.says("random", "--env", "acme/glidr", "--cases", "0")
+    near = operator.says("try", STILL, "--env", "acme/glidr", "--cases", "0")
     assert near.returncode == 2
     assert "no worker offers acme/glidr; near: acme/glider" in near.stderr
-    wrong = operator.says("random", "--env", "acme/glider@0123456789abcdef", "--cases", "0")
+    wrong = operator.says("try", STILL, "--env", "acme/glider@0123456789abcdef", "--cases", "0")
     assert (
         f"no worker offers acme/glider in definition 0123456789abcdef; offered are: {digest}" in wrong.stderr
     )
 
-    by_digest = operator.says("random", "--env", f"acme/glider@{digest[:8]}", "--cases", "0,1", "--json")
+    by_digest = operator.says("try", STILL, "--env", f"acme/glider@{digest[:8]}", "--cases", "0,1", "--json")
     assert by_digest.returncode == 0, by_digest.stderr
     approved = operator.says("envs", "approve", f"acme/glider@{digest}")
     assert approved.returncode == 0, approved.stderr

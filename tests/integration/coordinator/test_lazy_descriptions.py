@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from commands import STILL
 from coordinator_harness import Coordinator
 from waiting import wait_until
 
@@ -94,7 +95,7 @@ def test_an_awaited_environment_is_described_and_kept_for_later_starts(cluster: 
     described, later = wait_until(lambda: found if any(found := cluster.offered()) else None)
     assert (described, later) == (set(), ids)
     env = "gymnasium/CartPole-v1"
-    (scored,) = cluster.says("random", "--env", env, "--cases", "0,1")
+    (scored,) = cluster.says("try", STILL, "--env", env, "--cases", "0,1")
     assert (scored["env"], scored["n_failed"]) == (env, 0)
     assert cluster.offered() == ({env}, ids - {env})
     # `verify` and `rescore` ask before they have anything played.

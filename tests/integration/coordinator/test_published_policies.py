@@ -54,7 +54,9 @@ def test_deterministic_policies_give_the_recorded_actions_and_a_false_declaratio
     tmp_path: Path, scope: str
 ) -> None:
     program = agent(tmp_path, AGENT)
-    numbers = words(f"--env toy/line --state st --budget 5 --validation 3 --heldout 4 --policy-scope {scope}")
+    numbers = words(
+        f"--env toy/line --state st --budget 5 --validation 3 --heldout 4 --set policy_scope={scope}"
+    )
     for kind in ("honest", "lying", "silent"):
         own = ("--agent", f"{program} {kind}", "--entry", kind, "--exp-id", kind)
         evopolicy(tmp_path, "local", *numbers, *own, code=0)

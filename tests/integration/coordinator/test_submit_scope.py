@@ -48,7 +48,7 @@ class Played:
         options = words("--jail none --budget 4 --validation 2 --heldout 2 --env toy/line --state st")
         self.runs: dict[str, Path] = {}
         for scope in ("submit", "episode"):
-            where = words(f"--runs {scope} --policy-scope {scope}")
+            where = words(f"--runs {scope} --set policy_scope={scope}")
             evopolicy(root, "local", *options, *own, *where, code=0)
             self.runs[scope] = next((root / scope).glob("*/*/*/run.json")).parent
 

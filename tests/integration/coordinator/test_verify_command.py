@@ -123,7 +123,7 @@ def test_episodes_that_garbage_collection_removed_are_told_by_the_exit_code(
 @pytest.mark.timeout(600)
 def test_a_run_with_own_hidden_cases_is_verified_where_known(played: Played) -> None:
     on = ("--credentials", played.operator)
-    played.play("run", "--env", "toy/line", "--hidden-cases", "per-run", "--exp-id", OWN, *on)
+    played.play("run", "--env", "toy/line", "--set", "hidden_cases=per-run", "--exp-id", OWN, *on)
     (run,) = [path.parent for path in played.root.glob("runs/*/toy_line/own*/run.json")]
     report = played.verify(run, code=0)
     assert (report["identical"], report["episodes"], report["not_checked"]) == (True, 8, [])

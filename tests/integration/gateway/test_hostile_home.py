@@ -29,7 +29,6 @@ COMMANDS = {
     "run": f"{EVOPOLICY} run --local {PLAYED}",
     "local": f"{EVOPOLICY} local {PLAYED}",
     "suite": f"{EVOPOLICY} suite t.toml --local",
-    "random": f"{EVOPOLICY} random --env toy/line --split train --cases 0",
     "state": f"{EVOPOLICY} local {PLAYED} --runs /tmp/evopolicy-nowhere --state state",
     "gc": f"{EVOPOLICY} gc --state old",
     "report": f"{EVOPOLICY} report runs --out report",
@@ -99,7 +98,7 @@ def refused(where: str, command: str, folder: Path, *namespaces: str, code: int 
     return output
 
 
-@pytest.mark.parametrize("name", [name for name in COMMANDS if name not in ("random", "worker")])
+@pytest.mark.parametrize("name", [name for name in COMMANDS if name != "worker"])
 def test_a_read_only_home_is_reported_before_anything_is_begun(home: Path, name: str) -> None:
     StateFolder.open(home / "old").close()
     where = f"mount --bind {home} {home}; mount -o remount,ro,bind {home}; cd {home}"
@@ -109,7 +108,7 @@ def test_a_read_only_home_is_reported_before_anything_is_begun(home: Path, name:
     assert any(option in output for option in ("--out", "--runs", "--state")), output
 
 
-@pytest.mark.parametrize("name", ["try", "local", "suite", "random", "worker"])
+@pytest.mark.parametrize("name", ["try", "local", "suite", "worker"])
 @pytest.mark.parametrize("limit", ["size=1m", "nr_inodes=20"])
 def test_a_full_temporary_folder_is_reported_at_the_start(home: Path, name: str, limit: str) -> None:
     full = home / "tmp"

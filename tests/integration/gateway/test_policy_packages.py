@@ -10,7 +10,7 @@ from importlib.metadata import version
 from pathlib import Path
 
 import pytest
-from commands import agent, ended, played_here, record_in, run_dir
+from commands import STILL, agent, ended, played_here, record_in, run_dir
 
 import evopolicy as evp
 from evopolicy_common.records.run_record import RunRecord
@@ -95,7 +95,7 @@ def test_a_checkpoint_is_tried_with_its_runs_or_the_named_packages(root: Path, r
     assert "No module named 'scipy'" in out
     _, err = ended(root, "try", str(root), *where, "--policy-package", "no-such-package", ends=2)
     assert "package 'no-such-package' is not installed here; install it with" in err
-    ended(root, "random", *where, "--policy-package", "scipy")
+    ended(root, "try", STILL, *where, "--policy-package", "scipy")
 
 
 def test_published_policies_import_what_the_checker_allows_them_by_name(root: Path) -> None:

@@ -119,7 +119,7 @@ def test_the_page_about_coding_agents_runs_its_agents(tmp_path: Path) -> None:
         for page in pages
         for block in blocks(page, "")
         for line in block.replace("\\\n", " ").splitlines()
-        if line.startswith(("evopolicy texts", "evopolicy run")) and "remote" not in line
+        if line.startswith(("evopolicy files texts/", "evopolicy run")) and "remote" not in line
     ]
     (endpoint,) = [one for one in blocks("how-to/agents-api-key.md", "toml") if "EXAMPLE_API_KEY" in one]
     (tmp_path / "c").mkdir()
@@ -134,7 +134,7 @@ def test_the_page_about_coding_agents_runs_its_agents(tmp_path: Path) -> None:
         }
         played = []
         for number, line in enumerate([*lines, own]):
-            if line.startswith("evopolicy texts"):
+            if line.startswith("evopolicy files texts/"):
                 bash(line, tmp_path, **shown)
                 continue
             agent = line.partition("--agent ")[2].split()[0].strip('"').partition(":")[0]
@@ -153,7 +153,9 @@ def test_the_page_about_coding_agents_runs_its_agents(tmp_path: Path) -> None:
 
 def test_the_documented_schema_accepts_the_documented_suite_file(tmp_path: Path) -> None:
     pages = ("how-to/sweeps.md", "reference/files.md")
-    found = [re.findall(r"`(evopolicy schema [^`]*>[^`]*)`", (DOCS / page).read_text()) for page in pages]
+    found = [
+        re.findall(r"`(evopolicy files schemas/[^`]*>[^`]*)`", (DOCS / page).read_text()) for page in pages
+    ]
     ((line,), (same,)) = found
     assert line == same
     bash(line, tmp_path)

@@ -113,9 +113,10 @@ def test_the_page_is_that_of_the_code() -> None:
 
 def test_the_command_prints_a_schema_and_refuses_other_names() -> None:
     evopolicy = str(Path(sys.executable).with_name("evopolicy"))
-    done = subprocess.run([evopolicy, "schema", "run.json"], capture_output=True, text=True, check=True)
+    done = subprocess.run(
+        [evopolicy, "files", "schemas/run.json.schema.json"], capture_output=True, text=True, check=True
+    )
     assert json.loads(done.stdout) == json.loads(msgspec.json.encode(schemas.schema("run.json")))
-    wrong = subprocess.run([evopolicy, "schema", "runs.json"], capture_output=True, text=True, check=False)
+    wrong = subprocess.run([evopolicy, "files", "schemas/runs"], capture_output=True, text=True, check=False)
     assert wrong.returncode == 2
-    assert "no schema 'runs.json'" in wrong.stderr
-    assert "summary.json" in wrong.stderr
+    assert "no file 'schemas/runs'" in wrong.stderr

@@ -186,7 +186,7 @@ class AgentConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     max_tokens: Annotated[int, Meta(ge=1)] | None = None
     """Limit per run, all kinds of tokens together."""
     max_cost: Annotated[float, Meta(gt=0)] | None = None
-    """Limit per run, US dollars; needs `prices`, here or from `--prices`."""
+    """Limit per run, US dollars; needs `prices`, here or from `--set prices=FILE.toml`."""
     prices: Prices | None = None
     prompts: Prompts | None = None
     """Texts in place of the standard prompts; those of the run's own options win."""

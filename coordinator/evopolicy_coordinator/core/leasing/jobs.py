@@ -9,7 +9,7 @@ Seeds are keyed hashes that are reproducible and reveal neither the case's seed 
 policy_seed = HMAC-SHA256(run secret, submit index | split | case id | occurrence)[:16]
 
 The uniform-random reference has no policy. Its actions follow from the split and the case alone, so that every run on a
-split, and `evopolicy random`, get the same returns:
+split get the same returns:
 
 reference_seed = SHA-256("evopolicy random reference" NUL JSON of [split, case seed, options, occurrence])[:16]
 """

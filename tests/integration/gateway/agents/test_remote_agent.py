@@ -184,7 +184,7 @@ def test_a_listener_has_the_address_that_the_operator_named() -> None:
         ("remote --http 127.0.0.1:0 --agent-host my-laptop", "boot_id"),
         ("evolve --hidden-isolation off", "evopolicy-coordinator --hidden-isolation"),
         ("evolve --local --hidden-isolation none", "'related', 'strict', 'off'"),
-        ("evolve --hidden-cases mine", "'shared', 'per-run'"),
+        ("evolve --set hidden_cases=mine", "'shared', 'per-run'"),
     ],
 )
 def test_options_that_do_not_go_together_are_refused(tmp_path: Path, options: str, problem: str) -> None:

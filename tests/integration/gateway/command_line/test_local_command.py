@@ -121,7 +121,7 @@ def test_feedback_is_the_same_with_one_slot_and_with_two(tmp_path: Path) -> None
     trees = []
     for slots in ("1", "2"):
         arguments = ["local", "--env", "toy/line", "--agent", "replay:given", "--exp-id", f"s{slots}", *SMALL]
-        more = ["--slots", slots, "--state", str(tmp_path / "state"), "--max-episodes", "6"]
+        more = ["--slots", slots, "--state", str(tmp_path / "state"), "--set", "max_episodes=6"]
         ended(tmp_path, *arguments, *more)
         feedback = run_dir(tmp_path, exp_id=f"s{slots}") / "workspace" / "feedback"
         trees.append(

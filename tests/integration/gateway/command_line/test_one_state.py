@@ -7,7 +7,7 @@ import json
 from pathlib import Path
 
 import pytest
-from commands import SMALL, agent, command, ended, record_in, run_dir
+from commands import SMALL, STILL, agent, command, ended, record_in, run_dir
 from waiting import wait_until
 
 from evopolicy_common.local.cluster import WORKERS_ENDED
@@ -118,11 +118,11 @@ def test_a_second_command_beside_the_first_is_told_what_to_do(tmp_path: Path) ->
     words = ["local", "--env", "toy/line", "--agent", waits, "--entry", "waits", "--exp-id", "t", *SMALL]
     with command(tmp_path, *words) as running:
         wait_until(lambda: [*(tmp_path / "runs").glob("*/*/t/workspace/here")])
-        _, err = ended(tmp_path, "random", "--env", "toy/line", "--split", "train", "--cases", "0", ends=2)
+        _, err = ended(tmp_path, "try", STILL, "--env", "toy/line", "--cases", "0", ends=2)
         assert "--fresh" in err
         assert "--state" in err
         assert not (state / WORKERS_ENDED).exists()
-        words = ["random", "--env", "toy/line", "--split", "train", "--cases", "0", "--fresh"]
+        words = ["try", STILL, "--env", "toy/line", "--cases", "0", "--fresh"]
         out, _ = ended(tmp_path, *words)
         assert "the next call has others under the same ids" in out
         assert "played by" not in out
@@ -134,7 +134,7 @@ def test_a_second_command_beside_the_first_is_told_what_to_do(tmp_path: Path) ->
 
 
 def test_state_and_fresh_do_not_go_together(tmp_path: Path) -> None:
-    words = ("random", "--env", "toy/line", "--fresh", "--state", "x")
+    words = ("try", STILL, "--env", "toy/line", "--fresh", "--state", "x")
     assert "give only one of them" in ended(tmp_path, *words, ends=2)[1]
     words = ("run", "--env", "toy/line", "--agent", "random", "--fresh")
     assert "apply only with --local" in ended(tmp_path, *words, ends=2)[1]
@@ -143,7 +143,7 @@ def test_state_and_fresh_do_not_go_together(tmp_path: Path) -> None:
 def test_a_browser_is_that_of_a_cluster_that_the_command_brings_up(tmp_path: Path) -> None:
     browser = ("--browser", "/bin/true")
     for words in (
-        ("random", "--env", "toy/line", "--credentials", "x"),
+        ("try", STILL, "--env", "toy/line", "--credentials", "x"),
         ("run", "--env", "toy/line", "--agent", "random"),
     ):
         assert "give it to each evopolicy-worker" in ended(tmp_path, *words, *browser, ends=2)[1]

@@ -243,7 +243,14 @@ for line in sys.stdin:
 """
     (tmp_path / "rules.md").write_text("House rules for $env.\n$standard")
     (tmp_path / "prompts.toml").write_text('first = "Begin, please."\n')
-    text_options = ("--feedback", "scores", "--agents-md", "rules.md", "--prompts", "prompts.toml")
+    text_options = (
+        "--set",
+        "feedback=scores",
+        "--set",
+        "agents_md=rules.md",
+        "--set",
+        "prompts=prompts.toml",
+    )
     played = ran(code, *text_options)
     folder = played.folder
     record = played.record

@@ -1,4 +1,4 @@
-"""`evopolicy try` and `evopolicy random`: cases played outside any run."""
+"""`evopolicy try`: cases played outside any run."""
 
 from __future__ import annotations
 
@@ -74,12 +74,3 @@ def test_the_same_ids_are_the_same_cases_in_the_next_call(operator_file: Path, t
         returns.append({one["case"]: one["episode_return"] for one in json.loads(out)[0]["episodes"]})
     assert returns[0] == returns[1]
     assert len(set(returns[0].values())) == 4
-
-
-def test_random_plays_the_reference_on_a_split(operator_file: Path, tmp_path: Path) -> None:
-    where = ["--env", "toy", "--cases", "0-3", "--json", "--credentials", str(operator_file)]
-    out, _ = ended(tmp_path, "random", *where)
-    assert [(result["env"], len(result["episodes"])) for result in json.loads(out)] == [
-        ("toy/line", 4),
-        ("toy/maze", 4),
-    ]

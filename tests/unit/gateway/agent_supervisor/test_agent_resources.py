@@ -138,7 +138,7 @@ def test_a_memory_hog_is_ended_and_told(tmp_path: Path) -> None:
 def test_an_agent_that_dies_of_its_memory_limit_has_the_reason(tmp_path: Path) -> None:
     played = play(tmp_path, "held = [b'x' * (1 << 24) for _ in range(64)]", memory_bytes=200_000_000)
     assert played.ended.reason == "agent_failed"
-    assert "its memory limit of 200,000,000 bytes (--agent-memory)" in played.ended.detail
+    assert "its memory limit of 200,000,000 bytes (agent_memory)" in played.ended.detail
 
 
 def test_memory_file_systems_of_the_jail_are_bounded(tmp_path: Path) -> None:
@@ -161,7 +161,7 @@ def test_memory_file_systems_of_the_jail_are_bounded(tmp_path: Path) -> None:
 def test_an_agent_that_fills_its_disk_is_ended(tmp_path: Path, path: str, unlink: str) -> None:
     played = play(tmp_path, FILLER.format(path=path, unlink=unlink), disk_bytes=10_000_000)
     assert played.ended.reason == "disk_limit"
-    assert "10,000,000 are allowed (--agent-disk)" in played.ended.detail
+    assert "10,000,000 are allowed (agent_disk)" in played.ended.detail
     assert played.used.disk_bytes > 30_000_000
 
 

@@ -24,6 +24,7 @@ from evopolicy_common.messages.run_settings import PUBLISHED, off_profile
 from evopolicy_common.records.open_run import Rejected
 from evopolicy_common.records.run_record import decode_run_record, encode_run_record
 from evopolicy_gateway.cli.play import _unjailed
+from evopolicy_gateway.declared import declared, set_values
 from evopolicy_gateway.jail.settings import JailSettings
 from evopolicy_gateway.operator.cluster import Cluster
 from evopolicy_gateway.operator.trials import policy_bundle
@@ -155,11 +156,32 @@ def test_wrong_option_values_name_the_option() -> None:
             cases_of(wrong)
     with pytest.raises(ConfigError, match="16 environments"):
         one_environment("core16")
-    choices = "--policy-scope run --observations x --finish late --step-limit 9 --profile p --tier docker --video on"
-    words = choices.split()
+    words = ["--profile", "p", "--tier", "docker", "--video", "on"]
     for option, text in zip(words[::2], words[1::2], strict=True):
         with pytest.raises(typer.BadParameter, match=f"'{text}' is not one of"):
             parse(["evopolicy", "run", "--env", "toy/line", "--agent", "evolve", option, text])
+
+
+@pytest.mark.parametrize(
+    ("text", "problem"),
+    [
+        ("policy_scope=run", "use one of 'episode', 'submit'"),
+        ("finish=late", "use one of 'early', 'budget'"),
+        ("min_episodes=0", "Expected `int` >= 1"),
+        ("agent_cpus=many", "Expected `float"),
+        ("polcy_scope=submit", "did you mean policy_scope="),
+        ("budget=3", "write NAME=VALUE with one of"),
+        ("policy_scope", "write NAME=VALUE"),
+    ],
+)
+def test_a_wrong_further_setting_names_the_remedy(text: str, problem: str) -> None:
+    with pytest.raises(ConfigError, match=f"--set {text}: .*{problem}"):
+        set_values(declared(RunOptions), [text])
+
+
+def test_further_settings_are_those_of_suite_files() -> None:
+    given = set_values(declared(RunOptions), ["policy-scope=submit", "min_episodes=4", "prompts=p.toml"])
+    assert given == {"policy_scope": "submit", "min_episodes": 4, "prompts": Path("p.toml")}
 
 
 def test_profile_published_makes_every_published_choice_and_takes_no_other() -> None:

@@ -108,7 +108,7 @@ def test_max_cost_needs_prices_which_an_option_gives(tmp_path: Path) -> None:
     assert terms is not None
     assert (terms.prices, terms.limits.max_cost) == (Prices(input=1.0, output=10.0), 2.0)
     without = msgspec.structs.replace(plan, prices=None)
-    with pytest.raises(ConfigError, match=r"max_cost needs prices .* give a file with --prices"):
+    with pytest.raises(ConfigError, match=r"max_cost needs prices .* give a file with --set prices"):
         without.harness()
     # Prices do not define a run: a sweep whose prices change goes on.
     assert plan.digest == without.digest
