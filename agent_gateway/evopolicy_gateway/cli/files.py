@@ -43,7 +43,7 @@ def files(
             else:
                 say_lines(made[wanted]().splitlines())
             return
-        everything = [*shipped.files(), *made.items()]
+        everything: list[tuple[str, Path | Callable[[], str]]] = [*shipped.files(), *made.items()]
         chosen = [
             (each, place)
             for each, place in everything
