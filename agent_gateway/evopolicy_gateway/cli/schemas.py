@@ -98,7 +98,8 @@ def page() -> str:
             "`evopolicy files schemas/NAME.schema.json` prints the JSON Schema of each of these files (draft 2020-12);"
             " this page is made from the same source.\n\nAn editor with TOML schemas completes and checks a suite file"
             " whose first line names its schema: run"
-            " `evopolicy files schemas/suite.toml.schema.json > suite.schema.json`, and begin the file with `#:schema ./suite.schema.json`.\n"
+            " `evopolicy files schemas/suite.toml.schema.json > suite.schema.json`, and begin the file"
+            " with `#:schema ./suite.schema.json`.\n"
         ),
     ]
     for name, kind in KINDS.items():
