@@ -6,6 +6,7 @@ original.toml.
 
 from __future__ import annotations
 
+import textwrap
 import tomllib
 from functools import cache
 from pathlib import Path
@@ -69,26 +70,21 @@ The newest version of the original also has, and we do not offer:
 
 
 def short() -> str:
-    """The table of README.md, two suites to a row, and the lines beneath it."""
-    original, families = _original(), _families()
-    named = original["paper"]["families"]
+    """The list of README.md."""
+    families = _families()
+    named = _original()["paper"]["families"]
     total, deterministic = _total(families), sum(map(_deterministic, families))
-    played = sum(each in _tables()[0] for suite in families for each in suite.environments)
     ids = sum(len(suite.environments) for suite in families)
-    every = "All ids are" if deterministic == ids else f"{deterministic:,} ids are"
-    rows = "\n".join(
-        f"| {f'**`{suite.name}`**' if suite.name in named else f'`{suite.name}`'}"
-        f" | {len(suite.environments):,} | {' | '.join(_cost(suite))} |"
+    every = "All are" if deterministic == ids else f"{deterministic:,} are"
+    listed = ", ".join(
+        f"{f'**`{suite.name}`**' if suite.name in named else f'`{suite.name}`'} {len(suite.environments):,}"
         for suite in families
     )
-    return f"""| suite | environments | measured | CPU ms, bare | CPU ms, slot |
-|---|--:|--:|--:|--:|
-{rows}
-
-The {len(families)} suites hold {total:,} environments; the paper names the families in bold (together `paper13`). {every}
-deterministic: seed and actions determine the episode. `evopolicy-worker check-env ID` plays an environment in two processes
-and compares the episodes; it has confirmed {"all" if played == total else f"{played:,}"} ids.
-{CPU}"""  # noqa: E501
+    text = (
+        f"{listed}. The {len(families)} suites hold {total:,} environments; the paper names the families in bold"
+        f" (together `paper13`). {every} deterministic: seed and actions determine the episode."
+    )
+    return textwrap.fill(text, 125, break_long_words=False, break_on_hyphens=False)
 
 
 MARKS = {
