@@ -37,7 +37,11 @@ mark."""
 
 _WALLS = (
     *(f"tests/conformance/{name}/" for name in ("cheats", "hostile")),
-    *(f"tests/unit/{name}/" for name in ("gateway/jail", "worker/runtime", "worker/slot_endings")),
+    *(f"tests/unit/gateway/{name}/" for name in ("jail", "agent_supervisor")),
+    *(
+        f"tests/unit/{name}"
+        for name in ("worker/runtime/", "worker/slot_endings/", "common/processes/test_cgroups.py")
+    ),
     *(f"tests/integration/{name}" for name in ("worker/", "gateway/agents/test_jailed_agents.py")),
 )
 """Tests of sandbox and jail, which root gets in another way than an ordinary user: marked `walls`."""

@@ -261,7 +261,9 @@ async def begun(
 ) -> asyncio.Task[tuple[EpisodeOutcome, ...]]:
     """A job that is being played: its policy's process is there and has begun to work."""
     before, taken = len(family(pid_of(slot))), 0
-    job = make_job(**options)  # type: ignore[arg-type]
+    job = make_job(
+        **({"limits": msgspec.structs.replace(QUICK, act_wall_s=90.0, episode_wall_s=90.0)} | options)
+    )
 
     def note(episodes: int, steps: int) -> None:
         nonlocal taken

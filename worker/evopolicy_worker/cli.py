@@ -7,6 +7,7 @@ import contextlib
 import fcntl
 import os
 import secrets
+import shutil
 import signal
 import socket
 import sys
@@ -26,7 +27,7 @@ from evopolicy_common.errors import ConfigError, MachineError, SandboxError
 from evopolicy_common.logs import structlog
 from evopolicy_common.messages.environment import EnvironmentDescription
 from evopolicy_common.messages.episode import Tier
-from evopolicy_common.processes import host
+from evopolicy_common.processes import distribution, host
 from evopolicy_common.processes.notices import notify_of_many_slots
 from evopolicy_common.processes.packages import checked_names, policy_versions
 from evopolicy_common.processes.preflight import check_scratch
@@ -211,8 +212,11 @@ app.command("setup")(setup.command)
 
 
 def _refused(tier: Tier, why: str | None, *, unsandboxed: bool) -> ConfigError:
+    advice = "`evopolicy-worker doctor` checks this machine"
+    if tier == "bwrap" and shutil.which("bwrap") is not None:
+        advice = f"permit user namespaces ({distribution.permit_namespaces()})"
     return ConfigError(
-        f"sandbox tier {tier} does not work here: {why}; `evopolicy-worker doctor` checks this machine."
+        f"sandbox tier {tier} does not work here: {why}; {advice}."
         f" {_other_tier(available_tiers(unsandboxed=unsandboxed))}"
     )
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import platform
 from pathlib import Path
 
@@ -40,7 +41,8 @@ _SETTINGS = (
     ),
 )
 """Files below `/proc/sys`, the value that forbids user namespaces, and the remedy until the next reboot."""
-_CONTAINER_MARKS = ("/.dockerenv", "/run/.containerenv")
+_CONTAINER_MARKS = ("/.dockerenv", "/run/.containerenv", "/run/systemd/container")
+_CONTAINER_OPTIONS = "--security-opt seccomp=unconfined --security-opt systempaths=unconfined"
 
 
 def install(what: str) -> str:
@@ -57,17 +59,19 @@ def install(what: str) -> str:
     return f"{commands['debian']} (Debian, Ubuntu), {commands['fedora']} (Fedora)"
 
 
-def permit_namespaces(settings: Path = Path("/proc/sys")) -> str:
-    """How to permit user namespaces: the settings that forbid them now, or else all settings that could."""
+def permit_namespaces(settings: Path = Path("/proc/sys"), *, container: bool | None = None) -> str:
+    """How to permit user namespaces: the settings that forbid them now, or else all settings that could. A container
+    cannot change them (None: whether this is one is found out)."""
     remedies = []
     for name, forbids, remedy in _SETTINGS:
         with contextlib.suppress(OSError):
             remedies += [remedy] if (settings / name).read_text().strip() == forbids else []
+    if container is None:
+        container = "container" in os.environ or any(Path(mark).exists() for mark in _CONTAINER_MARKS)
+    if container:
+        on_host = f", and on its host: {'; '.join(remedies)}" if remedies else ""
+        return f"this is a container: start it with {_CONTAINER_OPTIONS}{on_host}"
     if remedies:
         return "; ".join(remedies)
-    if any(Path(mark).exists() for mark in _CONTAINER_MARKS):
-        return "this is a container: start it with --security-opt seccomp=unconfined --security-opt systempaths=unconfined"  # noqa: E501
     names = ", ".join(name.replace("/", ".") for name, _, _ in _SETTINGS)
-    return (
-        f"none of {names} forbids them here: in a container, start it with --security-opt seccomp=unconfined"
-    )
+    return f"none of {names} forbids them here: in a container, start it with {_CONTAINER_OPTIONS}"

@@ -122,6 +122,7 @@ class StateFolder:
         if self._link is not None:
             with contextlib.suppress(OSError):
                 self._link.unlink()
+                self._link.parent.rmdir()  # if it was the last
         os.close(self._lock_fd)
 
 
@@ -201,7 +202,8 @@ def _fits(folder: Path) -> bool:
 def _linked(root: Path) -> Path:
     """Returns a short link to `root`, always the same path, in a folder that only this user can change."""
     name = hashlib.sha256(os.fsencode(root)).hexdigest()[:16]
-    for folder in (credentials.state_home() / "sockets", Path("/tmp") / f"evopolicy-{os.getuid()}"):
+    places = (credentials.state_home() / "sockets", Path("/tmp") / f"evopolicy-{os.getuid()}")
+    for folder in 2 * places:  # twice: another coordinator that ends may remove an empty one meanwhile
         link = folder / name
         with contextlib.suppress(OSError):
             if _fits(link):

@@ -25,9 +25,7 @@ class NoCgroupError(SkipTest):
     """A cgroup cannot be made here."""
 
     def __init__(self, why: str) -> None:
-        super().__init__(
-            f"needs a cgroup of its own, which cannot be made here ({why}): run the tests as root"
-        )
+        super().__init__(f"needs a cgroup of its own ({why}): make test-root as root")
 
 
 class Cgroup:

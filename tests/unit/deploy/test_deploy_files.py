@@ -254,8 +254,8 @@ def test_docker_takes_the_compose_file() -> None:
     docker = shutil.which("docker")
     if docker is None or subprocess.run([docker, "compose", "version"], capture_output=True).returncode:
         pytest.skip(
-            "needs Docker with Compose v2: on Ubuntu apt-get install docker.io docker-compose-v2, elsewhere "
-            "see docs.docker.com/compose/install. The tests above check the file's content without it"
+            "needs Docker with Compose v2: apt-get install docker.io docker-compose-v2 (Ubuntu), elsewhere "
+            "see docs.docker.com/compose/install"
         )
     done = subprocess.run(
         [docker, "compose", "--file", str(DEPLOY / "compose.yaml"), "config", "--quiet"],

@@ -151,7 +151,8 @@ class Slot:
         except TimeoutError:
             failed = WorkerError(f"a slot did not start within {START_TIMEOUT_S:g} s")
         except SlotDiedError as error:
-            failed = WorkerError(str(error))
+            # Bubblewrap says why it cannot make a sandbox.
+            failed = (SandboxError if "bwrap: " in str(error) else WorkerError)(str(error))
         if failed is not None:
             await self.close()
             raise failed

@@ -29,9 +29,12 @@ from evopolicy_gateway.harnesses.interface.agent_config import AcpTable, AgentCo
 AGENTS = Path(__file__).parents[4] / "examples" / "agents"
 CLIS = os.environ.get("EVOPOLICY_REAL_CLIS", "")
 
-pytestmark = pytest.mark.skipif(
-    not CLIS, reason="needs the real CLIs: set EVOPOLICY_REAL_CLIS as this file's docstring says"
-)
+if not CLIS:
+    pytest.skip(
+        "the file's tests need the real CLIs: install them as its docstring says, then EVOPOLICY_REAL_CLIS=..."
+        " make test ARGS=tests/integration/gateway/agents/test_real_clis.py",
+        allow_module_level=True,
+    )
 
 SCRIPT = [Step(command=SUBMIT), Step(text="first"), Step(command=SUBMIT), Step(text="second")]
 FAILING = [*SCRIPT[:2], Step(status=503, text="overloaded"), *SCRIPT[2:]]

@@ -30,7 +30,7 @@ def group() -> Iterator[cgroups.Group]:
 
 
 @pytest.mark.skipif(
-    not {*cgroups.CONTROLLERS} <= cgroups.hierarchies().keys(), reason="no cgroups can be made here"
+    not {*cgroups.CONTROLLERS} <= cgroups.hierarchies().keys(), reason="needs cgroups: make test-root as root"
 )
 def test_a_group_limits_and_counts_what_joins_it(group: cgroups.Group) -> None:
     assert group.held.keys() == {*cgroups.CONTROLLERS}

@@ -47,9 +47,12 @@ def test_the_setting_that_forbids_namespaces_is_named_alone(name: str, value: st
         (tmp_path / other).parent.mkdir(exist_ok=True)
         (tmp_path / other).write_text("1\n")
     (tmp_path / name).write_text(f"{value}\n")
-    steps = permit_namespaces(tmp_path)
+    steps = permit_namespaces(tmp_path, container=False)
     assert f"sysctl -w {name.replace('/', '.')}=" in steps
     assert steps.count("sysctl -w") == 1
+    inside = permit_namespaces(tmp_path, container=True)
+    assert "start it with --security-opt" in inside
+    assert inside.endswith(f"on its host: {steps}")
 
 
 def test_where_no_setting_forbids_namespaces_a_container_is_named(tmp_path: Path) -> None:

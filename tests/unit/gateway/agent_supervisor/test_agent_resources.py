@@ -32,7 +32,7 @@ from evopolicy_gateway.processes.resources import Resources, used_bytes
 
 needs_cgroups = pytest.mark.skipif(
     not {"cpu", "memory", "pids"} <= cgroups.hierarchies().keys(),
-    reason="needs cgroups that this user may make: run as root, or in a scope that systemd delegates",
+    reason="needs cgroups: make test-root as root",
 )
 
 FORK_BOMB = """

@@ -100,6 +100,8 @@ def main() -> None:
         gc.freeze()
     except BaseException as error:
         control.send(json.dumps({"error": f"{type(error).__name__}: {error}"}).encode())
+        if isinstance(error, OSError):
+            sys.exit(1)  # the machine refuses, and the error says it all
         raise
     # Without the object, for which Python warns in each policy's process that nobody has closed it.
     zygote(control.detach(), config["namespaces"], lambda worker: policy_process(config, worker, streams))
