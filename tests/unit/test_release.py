@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import subprocess
 import sys
@@ -38,6 +39,17 @@ def test_workflows_make_targets_that_are_there() -> None:
             made |= {target for step in job["steps"] for target in re.findall(r"\bmake ([a-z-]+)", str(step))}
     assert {"check", "docs", "test", "test-root", "test-system", "test-families", "release"} == made
     assert made <= targets
+
+
+def test_a_named_python_has_an_installation_of_its_own() -> None:
+    # Make hands these on from a `make test` around this test.
+    variables = {name: value for name, value in os.environ.items() if not name.startswith(("MAKE", "PYTHON"))}
+    for words, folder in (
+        ([], ".venv"),
+        ([f"PYTHON={sys.executable}"], f".venv-{sys.version_info.major}.{sys.version_info.minor}"),
+    ):
+        shown = subprocess.check_output(["make", "-n", "demo", *words], cwd=ROOT, text=True, env=variables)
+        assert f"\n{folder}/bin/evopolicy demo\n" in f"\n{shown}"
 
 
 def test_the_version_is_the_same_everywhere() -> None:

@@ -142,7 +142,7 @@ async def local_cluster(
         if workers is not None:
             installs.divided(workers.env_ids)  # what nothing here can play is told before anything starts
         check_scratch()  # workers keep their sandboxes there
-        check_writable(root, "--state")
+        check_writable(root, "--state or XDG_STATE_HOME")
         root.mkdir(mode=0o700, parents=True, exist_ok=True)
         # Named after this process: the folder may be in use, and another command's file in it.
         ready_file = root / f"{kind}-{os.getpid()}.json"
