@@ -22,7 +22,7 @@ from pathlib import Path
 
 import msgspec
 
-from evopolicy_common.catalogue import earlier_folder_name, folder_name
+from evopolicy_common.catalogue import folder_name
 from evopolicy_common.catalogue.worlds import KEY, OPTION, unchanged
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.messages.environment import Case, Split
@@ -182,9 +182,7 @@ def load(folder: Path) -> tuple[EnvironmentSplits | None, list[str]]:
 
 def _file_faults(folder: Path, split: Split, content: SplitFile, env: str) -> list[str]:
     own = content.env
-    in_place = folder.name in (folder_name(own), earlier_folder_name(own)) or folder.as_posix().endswith(
-        f"/{own}"
-    )
+    in_place = folder.name == folder_name(own) or folder.as_posix().endswith(f"/{own}")
     faults = (
         (content.split not in (split, FILE_STEMS[split]), f"says it is split {content.split!r}"),
         (own != env, f"is of environment {own!r}, train.json of {env!r}"),

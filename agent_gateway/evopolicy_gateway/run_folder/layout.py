@@ -15,7 +15,7 @@ from typing import TypeVar
 
 import msgspec
 
-from evopolicy_common.catalogue import earlier_folder_name, folder_name
+from evopolicy_common.catalogue import folder_name
 from evopolicy_common.errors import DECODE_ERRORS, ConfigError
 from evopolicy_common.records import model_calls, model_record, open_run
 from evopolicy_common.records.blobs import write_atomically
@@ -170,10 +170,6 @@ def run_folder(runs: Path, entry: str, env: str, exp_id: str) -> RunFolder:
     if not keys.valid_name(exp_id):
         raise ConfigError(f"--exp-id {exp_id!r}: letters, digits, '.', '_' and '-' only, 63 at most")
     above = runs.absolute() / entry_folder(entry)
-    earlier = RunFolder(above / earlier_folder_name(env) / exp_id)
-    # Also while a run is replaced, whose folder is missing for moments: the lock is beside it.
-    if any(path.exists() for path in (earlier.root, earlier.lock, earlier.asked)):
-        return earlier
     return RunFolder(above / folder_name(env) / exp_id)
 
 

@@ -27,7 +27,6 @@ from evopolicy_common.catalogue import worlds
 from evopolicy_common.catalogue.definition import USUAL_STEPS as USUAL_STEPS
 from evopolicy_common.catalogue.definition import Entry as Entry
 from evopolicy_common.catalogue.definition import Wrapper as Wrapper
-from evopolicy_common.catalogue.definition import earlier_folder_name as earlier_folder_name
 from evopolicy_common.catalogue.definition import folder_name as folder_name
 from evopolicy_common.catalogue.definition import policy_folder as policy_folder
 from evopolicy_common.catalogue.definition import read_file

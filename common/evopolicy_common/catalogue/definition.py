@@ -129,11 +129,6 @@ def policy_folder(policies: Path, env_id: str) -> Path:
     return family if family.is_dir() and not (policies / name).is_dir() else policies / name
 
 
-def earlier_folder_name(env_id: str) -> str:
-    """As `folder_name` in earlier versions, whose folders are read too: with the colon of `module:Id`."""
-    return env_id.replace("/", "_")
-
-
 def read_file(path: Path) -> tuple[Entry, ...]:
     """The environments of a file. Raises ConfigError that names file, environment, field and remedy."""
     data = read_given(path, f"environment file {path}", MAX_FILE_BYTES)

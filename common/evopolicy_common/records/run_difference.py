@@ -1,8 +1,7 @@
 """Differences between two run directories, except for the published lists `EXCLUDED_FILES` and `EXCLUDED_FIELDS`.
 
 All else must be equal byte for byte, JSON files except for the excluded fields: the same agent on the same cases gives
-the same run, independent of the number of workers, their order, and failures. When exactly one of the two runs was
-written by an earlier version, `OLD_FILES` and `OLD_FIELDS` are excluded too.
+the same run, independent of the number of workers, their order, and failures.
 """
 
 from __future__ import annotations
@@ -10,14 +9,11 @@ from __future__ import annotations
 import filecmp
 import fnmatch
 import json
-import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from evopolicy_common.processes.left_files import left_files
-from evopolicy_common.records.run_files import RUN_JSON
-from evopolicy_common.records.run_record import upgraded
 from evopolicy_common.regular_files import MAX_BYTES, read_regular
 
 EXCLUDED_FILES: Mapping[str, str] = {
@@ -56,17 +52,6 @@ EXCLUDED_FIELDS: Mapping[str, Mapping[str, str]] = {
 }
 """Fields that are not compared, by the name of their file, with the reason. The text files hold JSON lines."""
 
-OLD_FILES = ("checkpoints/*/_meta.json", "checkpoints/*/metrics.json")
-OLD_FIELDS: Mapping[str, tuple[str, ...]] = {
-    "run.json": ("versions.data_train_hash", "versions.data_valid_hash", "versions.data_heldout_hash"),
-    "summary.json": ("schema_version", "env_instances", "first_global_episode"),
-    "errors.txt": ("schema_version",),
-    "error.txt": ("schema_version",),
-}
-"""Fields that earlier versions wrote differently. Fields that only one of the two runs has are excluded too."""
-
-_OLD_SYSTEM = re.compile(r"^(checkpoints/[^/]+/)system/")
-
 MAX_PARSED_BYTES = MAX_BYTES
 """Files above this size (bytes) were written by an agent, whatever their names, and are compared as plain bytes."""
 MAX_COMPARED_BYTES = 1 << 30
@@ -82,12 +67,11 @@ def left_out() -> list[str]:
 
 def differences(left: Path, right: Path) -> list[str]:
     """One line per file or field in which two run directories differ; empty when they are the same run."""
-    old = _is_old(left) != _is_old(right)
-    ours, theirs = _files(left, old), _files(right, old)
+    ours, theirs = _files(left), _files(right)
     lines = [f"{name}: only in {left}" for name in sorted(ours.keys() - theirs.keys())]
     lines += [f"{name}: only in {right}" for name in sorted(theirs.keys() - ours.keys())]
     for name in sorted(ours.keys() & theirs.keys()):
-        lines += _file_differences(name, ours[name], theirs[name], old)
+        lines += _file_differences(name, ours[name], theirs[name])
     return lines
 
 
@@ -110,26 +94,15 @@ def shortened(differing: Sequence[str], left: Path, right: Path) -> list[str]:
     return [*scores, *others, *folders]
 
 
-def _is_old(root: Path) -> bool:
-    """Whether an earlier version wrote the run."""
-    try:
-        record = json.loads(read_regular(root / RUN_JSON))
-    except (OSError, ValueError, RecursionError):
-        return False
-    return isinstance(record, dict) and record.get("schema_version") == 1
-
-
-def _files(root: Path, old: bool) -> dict[str, Path]:
-    """The compared files by their path in the run. `old`: one of the two runs is from an earlier version."""
+def _files(root: Path) -> dict[str, Path]:
+    """The compared files by their path in the run."""
     paths = {str(path.relative_to(root)): path for path, _ in left_files(root)}
-    if old and _is_old(root):
-        paths = {_OLD_SYSTEM.sub(r"\1", name): path for name, path in paths.items()}
-    for pattern in (*EXCLUDED_FILES, *(OLD_FILES if old else ())):
+    for pattern in EXCLUDED_FILES:
         paths = {name: path for name, path in paths.items() if not fnmatch.fnmatchcase(name, pattern)}
     return paths
 
 
-def _file_differences(name: str, left: Path, right: Path, old: bool) -> list[str]:
+def _file_differences(name: str, left: Path, right: Path) -> list[str]:
     sizes = [path.stat().st_size for path in (left, right)]
     if min(sizes) > MAX_COMPARED_BYTES:
         return [f"{name}: {sizes[0]} and {sizes[1]} bytes, too many to compare"]
@@ -138,7 +111,7 @@ def _file_differences(name: str, left: Path, right: Path, old: bool) -> list[str
     file = name.rpartition("/")[2]
     if file not in EXCLUDED_FIELDS or max(sizes) > MAX_PARSED_BYTES:
         return [f"{name}: {sizes[0]} and {sizes[1]} bytes that are not the same"]
-    excluded = (*EXCLUDED_FIELDS[file], *(OLD_FIELDS.get(file, ()) if old else ()))
+    excluded = tuple(EXCLUDED_FIELDS[file])
     try:
         ours, theirs = (_parse(name, read_regular(path)) for path in (left, right))
         return [
@@ -146,7 +119,6 @@ def _file_differences(name: str, left: Path, right: Path, old: bool) -> list[str
             for path, a, b in _value_differences("", ours, theirs)
             if not any(path == each or path.startswith(f"{each}.") for each in excluded)
             and path.rpartition(".")[2] not in (excluded if name.endswith(".txt") else ())
-            and not (old and (a is ... or b is ...))
         ]
     except (ValueError, TypeError, AttributeError) as error:
         return [f"{name}: cannot be read: {error}"]
@@ -159,9 +131,7 @@ def _file_differences(name: str, left: Path, right: Path, old: bool) -> list[str
 def _parse(name: str, data: bytes) -> Any:
     if name.endswith(".txt"):
         return dict(enumerate(map(json.loads, data.splitlines())))
-    value = json.loads(data)
-    is_old = name == "run.json" and isinstance(value, dict) and value.get("schema_version") == 1
-    return upgraded(value) if is_old else value
+    return json.loads(data)
 
 
 def _value_differences(path: str, left: Any, right: Any) -> list[tuple[str, Any, Any]]:

@@ -34,10 +34,8 @@ from evopolicy_common.records.code_metrics import PUBLISHED_SCHEMA
 from evopolicy_common.records.model_record import Level
 from evopolicy_common.records.newest import described_data
 
-RECORD_VERSION = 3
-"""Version of our own fields. Incremented only when older readers would misunderstand a file, not for added fields:
-since 3, `tokens` are counted at the wire where `model_use` says so."""
-READABLE_VERSIONS = (2, 3)
+RECORD_VERSION = 4
+"""Version of our own fields. Incremented only when older readers would misunderstand a file, not for added fields."""
 
 PROTOCOL_VERSION = "protocol/v2.0-draft"
 """The agent-facing protocol that runs follow."""
@@ -482,9 +480,7 @@ def decode_run_record(data: bytes) -> RunRecord:
         raise ProtocolError(f"this is {newest}")
     try:
         header = _headers.decode(data)
-        if header.schema_version == 1:
-            return check_plausible(msgspec.convert(upgraded(msgspec.json.decode(data)), RunRecord))
-        if header.schema_version == PUBLISHED_SCHEMA and header.record_version in READABLE_VERSIONS:
+        if header.schema_version == PUBLISHED_SCHEMA and header.record_version == RECORD_VERSION:
             return check_plausible(_runs.decode(data))
     except (*DECODE_ERRORS, AttributeError, TypeError, ValueError) as error:
         raise ProtocolError(f"not a run record: {error}") from error
@@ -494,7 +490,7 @@ def decode_run_record(data: bytes) -> RunRecord:
         )
     raise ProtocolError(
         f"run.json has schema_version {header.schema_version} and record_version {header.record_version}; this version"
-        f" reads {PUBLISHED_SCHEMA} and {READABLE_VERSIONS[0]} to {RECORD_VERSION}: update evopolicy"
+        f" reads {PUBLISHED_SCHEMA} and {RECORD_VERSION}: use the version of evopolicy that wrote it"
     )
 
 
@@ -503,41 +499,4 @@ def sha256_text(digest: str) -> str:
     return f"sha256:{digest}" if digest else ""
 
 
-def upgraded(old: dict[str, Any]) -> dict[str, Any]:
-    """Converts a version 1 `run.json` to this version. Raises AttributeError, TypeError or ValueError if it is none."""
-    timing, artifacts, versions = (dict(old.get(name) or {}) for name in ("timing", "artifacts", "versions"))
-    outcome = dict(old.get("outcome") or {})
-    if outcome.get("status") == "no_ok_submit":
-        outcome["final_score"] = 0.0
-    if not outcome.get("val_scores"):
-        outcome["val_scores"] = None
-    data = {split: sha256_text(str(versions.get(f"data_{name}_hash", ""))) for split, name in _DATA.items()}
-    initial = versions.get("initial_policy_hash")
-    places = {
-        "workspace": artifacts.get("workspace"),
-        "feedback": artifacts.get("workspace") and f"{artifacts['workspace']}/feedback",
-        "checkpoints": artifacts.get("checkpoints"),
-        "logs_harness": artifacts.get("harness_log"),
-        "logs_agent": artifacts.get("agent_log"),
-    }
-    return {
-        **old,
-        "schema_version": PUBLISHED_SCHEMA,
-        "record_version": RECORD_VERSION,
-        "timing": {_TIMING.get(name, name): value for name, value in timing.items()},
-        "outcome": outcome,
-        "artifacts": {name: place for name, place in places.items() if place is not None},
-        "replays": artifacts.get("replays", []),
-        "versions": {
-            **versions,
-            "agents_md_hash": "",
-            "rules_hash": sha256_text(str(versions.get("agents_md_hash", ""))),
-            **{f"data_{name}_hash": data[split] for split, name in _DATA.items()},
-            "cases_hashes": data,
-            "initial_policy_hash": None if initial is None else sha256_text(str(initial)),
-        },
-    }
-
-
-_TIMING = {"started_at": "start_time", "finished_at": "end_time", "wall_s": "wall_time_seconds"}
 _DATA: dict[Split, str] = {"train": "train", "validation": "valid", "heldout": "heldout"}

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import msgspec
 
-from evopolicy_common.catalogue import earlier_folder_name, folder_name
+from evopolicy_common.catalogue import folder_name
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.messages.environment import Case, Split
 from evopolicy_common.regular_files import read_given
@@ -32,8 +32,7 @@ class SplitFile(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
 
 def folder_of(root: Path, env: str) -> Path:
     """Folder of the split files of `env` below `root`: `gym_acrobot/`, or as published `gym/acrobot/`."""
-    others = (root / env, root / earlier_folder_name(env))
-    return next(filter(holds_splits, others), root / folder_name(env))
+    return root / env if holds_splits(root / env) else root / folder_name(env)
 
 
 def folders_below(root: Path) -> list[Path]:

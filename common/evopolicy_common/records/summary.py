@@ -3,7 +3,6 @@
 The gateway writes it last in a submit's folder and answers `POST /submit` with the same bytes; the analysis reads it.
 It contains nothing hidden: no seed, no hidden score. In the summary of a submit that is not `ok`, all arrays and
 aggregates are null, while `env_instances`, `n_episodes` and `remaining_budget` still give the request and the charge.
-Earlier versions wrote `schema_version` 1, and null for `env_instances` in such summaries; these are read too.
 """
 
 from __future__ import annotations
@@ -18,7 +17,6 @@ from evopolicy_common.messages.gateway import SubmitStatus
 from evopolicy_common.records.code_metrics import PUBLISHED_SCHEMA
 
 SCHEMA_VERSION = PUBLISHED_SCHEMA
-_READ = (SCHEMA_VERSION, 1)
 
 
 class Summary(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
@@ -77,10 +75,10 @@ def decode_summary(data: bytes) -> Summary:
         summary = check_plausible(_decoder.decode(data))
     except (*DECODE_ERRORS, ValueError) as error:
         raise ProtocolError(f"not a submit summary: {error}") from error
-    if summary.schema_version not in _READ:
+    if summary.schema_version != SCHEMA_VERSION:
         raise ProtocolError(
-            f"summary has schema_version {summary.schema_version}, this version reads {SCHEMA_VERSION}: update"
-            " evopolicy"
+            f"summary has schema_version {summary.schema_version}, this version reads {SCHEMA_VERSION}: use"
+            " the version of evopolicy that wrote it"
         )
     return summary
 

@@ -13,7 +13,6 @@ from pathlib import Path
 import msgspec
 
 from evopolicy_common.processes.left_files import left_files
-from evopolicy_common.records.policies.checkpoints import policy_folder
 from evopolicy_common.regular_files import read_regular
 from evopolicy_results.behaviour.edits import Transition, classify
 from evopolicy_results.code.line_diff import unified
@@ -81,7 +80,7 @@ def trace(run: Run) -> Trace:
 
 def sources(run: Run, submit: Submit) -> dict[str, str]:
     """Text of a checkpoint's source bundle by path, `policy.py` first; all its Python files if it has no bundle."""
-    system = policy_folder(run.checkpoint(submit.index))
+    system = run.checkpoint(submit.index)
     try:
         if submit.source is not None:
             files = {path: read_regular(system / path) for path in submit.source.files}
@@ -115,7 +114,7 @@ def _images(run: Run, reading: LogReading) -> dict[int, list[Path]]:
 
     def candidates() -> Iterator[tuple[int, Path]]:
         for submit in run.submits:
-            for path in _image_files(policy_folder(run.checkpoint(submit.index))):
+            for path in _image_files(run.checkpoint(submit.index)):
                 yield submit.index, path
         for path in _image_files(run.workspace, skip="feedback") if run.submits else ():
             yield named.get(path.name, run.submits[-1].index), path

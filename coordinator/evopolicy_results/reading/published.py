@@ -155,7 +155,7 @@ def _budget(folder: Path, record: dict[str, Any], summaries: list[PublishedSumma
     if isinstance(budget, int):
         return budget
     first = min((folder / "checkpoints").glob("submit_*"), default=None)
-    meta = None if first is None else read_meta(first, 0)
+    meta = None if first is None else read_meta(first)
     if meta is not None:
         return meta.remaining_budget_before
     known = (one.remaining_budget + one.n_episodes for one in summaries if one.remaining_budget is not None)

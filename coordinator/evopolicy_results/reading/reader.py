@@ -25,7 +25,7 @@ from evopolicy_common.messages.environment import Split
 from evopolicy_common.messages.gateway import REJECTED
 from evopolicy_common.records.aggregates import mean, std
 from evopolicy_common.records.newest import described
-from evopolicy_common.records.policies.checkpoints import policy_folder, read_meta
+from evopolicy_common.records.policies.checkpoints import read_meta
 from evopolicy_common.records.rescores import Rescored, RescoreRecord, read_rescore
 from evopolicy_common.records.run_files import RUN_JSON, check_places, run_folders, submit_folders
 from evopolicy_common.records.run_record import (
@@ -202,7 +202,7 @@ def _read_submits(folder: Path, record: RunRecord) -> tuple[Submit, ...]:
                 ours = record.record_version != PUBLISHED
                 summary = decode_summary(read_regular(path)) if ours else published.read_summary(path)
         with _naming(checkpoint.relative_to(folder)):
-            meta = read_meta(checkpoint, budget)
+            meta = read_meta(checkpoint)
         if summary is not None:
             status: str = summary.status
             n_episodes, mean = summary.n_episodes, summary.mean_return
@@ -218,7 +218,7 @@ def _read_submits(folder: Path, record: RunRecord) -> tuple[Submit, ...]:
         before, consumed = consumed, budget - after
         files, source = None, None
         if status == "ok" and checkpoint.is_dir():
-            files, source = describe_files(read_python_files(policy_folder(checkpoint)))
+            files, source = describe_files(read_python_files(checkpoint))
         changed = None if files is None or previous is None else count_changed_lines(previous, files)
         previous = previous if files is None else files
         submits.append(

@@ -183,6 +183,6 @@ def _summary(folder: Path) -> Summary | None:
 
 def _meta(checkpoint: Path, episode_budget: int) -> CheckpointMeta | None:
     try:
-        return read_meta(checkpoint, episode_budget)
+        return read_meta(checkpoint)
     except ProtocolError as error:
         raise ConfigError(f"{checkpoint} is damaged: {error}") from error

@@ -8,16 +8,16 @@ from pathlib import Path
 from commands import evopolicy
 
 HERE = Path(__file__).parent
-EARLIER = HERE / "earlier_run"
-DATA = EARLIER / "data"
+GOLDEN_RUN = HERE / "golden_run"
+DATA = GOLDEN_RUN / "data"
 
 
-def play(root: Path, agent: Path, budget: int) -> Path:
+def play(root: Path, agent: Path, budget: int, python: str = sys.executable) -> Path:
     """The run directory that `agent` leaves."""
     done = evopolicy(
         root,
         *("local", "--env", "toy/line", "--entry", "agent", "--exp-id", "t", "--data", str(DATA)),
-        *("--agent", f"command:{sys.executable} {agent}", "--jail", "none"),
+        *("--agent", f"command:{python} {agent}", "--jail", "none"),
         *("--budget", str(budget), "--validation", "2", "--heldout", "2"),
     )
     assert done.returncode == 0, done.stdout + done.stderr

@@ -1,8 +1,7 @@
 """`checkpoints/submit_NNN/`: a submitted policy's files, with `_meta.json` and `metrics.json` beside them.
 
 The layout is the published one. If a policy has a file with one of these two names, `_meta.json` keeps it
-(`shadowed_files`), so that the bundle can be restored from the folder. Checkpoints of earlier versions have the policy
-in `system/`, and the content of `_meta.json` in `metrics.json`; they are read too.
+(`shadowed_files`), so that the bundle can be restored from the folder.
 """
 
 from __future__ import annotations
@@ -66,27 +65,7 @@ class CheckpointMeta(msgspec.Struct, frozen=True, kw_only=True):
     """The policy's own files that the metadata replace: path, whether it is executable, base64 of its bytes."""
 
 
-class _OldMetrics(msgspec.Struct, frozen=True, kw_only=True):
-    """`metrics.json` in the format of earlier versions."""
-
-    schema_version: int
-    submit_index: int
-    status: str
-    digest: str
-    n_episodes: int
-    consumed_budget: int
-    mean_return: float | None = None
-    val_mean: float | None = None
-    policy_bytes: int = 0
-
-
-class _Header(msgspec.Struct, frozen=True, kw_only=True):
-    schema_version: int | str
-
-
-_header = msgspec.json.Decoder(_Header)
 _meta = msgspec.json.Decoder(CheckpointMeta)
-_old_metrics = msgspec.json.Decoder(_OldMetrics)
 
 
 def measured(bundle: Bundle | None) -> CodeMetrics:
@@ -124,53 +103,24 @@ def without_metadata(files: tuple[BundleFile, ...]) -> Bundle:
     return bundles.pack([file for file in files if file.path not in METADATA])
 
 
-def read_meta(folder: Path, episode_budget: int) -> CheckpointMeta | None:
+def read_meta(folder: Path) -> CheckpointMeta | None:
     """The metadata of the checkpoint in `folder`; None when it has none. Raises ProtocolError when they are damaged."""
-    for name in (META, METRICS):
-        try:
-            data = read_regular(folder / name, _MAX_META_BYTES)
-            if name == META:
-                return check_plausible(_meta.decode(data))
-            if _header.decode(data).schema_version == PUBLISHED_SCHEMA:
-                return None  # the current `metrics.json`, without its `_meta.json`
-            return _upgraded(_old_metrics.decode(data), episode_budget)
-        except FileNotFoundError:
-            continue
-        except OSError as error:
-            raise ProtocolError(f"{name} cannot be read: {error.strerror}") from error
-        except (*DECODE_ERRORS, ValueError) as error:
-            raise ProtocolError(f"{name} is not a checkpoint's: {error}") from error
-    return None
-
-
-def _upgraded(old: _OldMetrics, episode_budget: int) -> CheckpointMeta:
-    after = episode_budget - old.consumed_budget
-    return CheckpointMeta(
-        submit_index=old.submit_index,
-        submit_time="",
-        n_episodes_requested=old.n_episodes,
-        remaining_budget_before=after + old.n_episodes,
-        remaining_budget_after=after,
-        snapshot_size_bytes=old.policy_bytes,
-        validation_status=old.status,
-        bundle=old.digest,
-        mean_return=old.mean_return,
-        val_mean=old.val_mean,
-    )
-
-
-def policy_folder(folder: Path) -> Path:
-    """The folder of the policy's files: `folder` itself, or its `system/` if an earlier version wrote it."""
-    old = not any((folder / name).exists() for name in (META, "policy.py")) and (folder / "system").is_dir()
-    return folder / "system" if old else folder
+    try:
+        return check_plausible(_meta.decode(read_regular(folder / META, _MAX_META_BYTES)))
+    except FileNotFoundError:
+        return None
+    except OSError as error:
+        raise ProtocolError(f"{META} cannot be read: {error.strerror}") from error
+    except (*DECODE_ERRORS, ValueError) as error:
+        raise ProtocolError(f"{META} is not a checkpoint's: {error}") from error
 
 
 def bundle_of(folder: Path) -> Bundle:
     """The submitted bundle. Raises BundleError when the folder has none that can be read."""
     if not (folder / META).exists():
-        return bundles.snapshot(policy_folder(folder))
+        return bundles.snapshot(folder)
     try:
-        meta = read_meta(folder, 0)
+        meta = read_meta(folder)
     except ProtocolError as error:
         raise BundleError(str(error)) from error
     own = () if meta is None else meta.shadowed_files

@@ -47,7 +47,7 @@ def test_local_plays_a_whole_run_and_leaves_nothing_behind(tmp_path: Path) -> No
     assert [*passed.places(running.mark.encode())] == [(0, len(running.mark))]
     best = folder / "checkpoints" / f"submit_{record.outcome.best_submit_index:03d}"
     assert (best / "policy.py").read_bytes() == (folder / "workspace/system/policy.py").read_bytes()
-    meta = read_meta(best, 6)
+    meta = read_meta(best)
     assert meta is not None
     assert record.outcome.val_scores is not None
     assert meta.val_mean == record.outcome.val_scores[str(record.outcome.best_submit_index)]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import ast
 import gc
-import json
 import sys
 import threading
 import time
@@ -20,7 +19,7 @@ from evopolicy_common.records.code_metrics import (
     declares_deterministic,
     parse,
 )
-from evopolicy_common.records.policies import bundles, checkpoints
+from evopolicy_common.records.policies import checkpoints
 from evopolicy_common.records.policies.bundles import MAX_FILES, BundleFile, pack
 from evopolicy_common.records.policies.checkpoints import CheckpointMeta, measured
 
@@ -44,8 +43,7 @@ def test_a_bundle_returns_from_its_checkpoint_with_metadatas_names(tmp_path: Pat
     folder = tmp_path / "submit_002"
     checkpoints.write(folder, META, bundle, measured(bundle))
     assert checkpoints.bundle_of(folder) == bundle
-    assert checkpoints.policy_folder(folder) == folder
-    meta = checkpoints.read_meta(folder, 8)
+    meta = checkpoints.read_meta(folder)
     assert meta is not None
     assert (meta.bundle, meta.snapshot_files) == (bundle.digest, [file.path for file in bundle.files])
     assert [file.path for file in meta.shadowed_files] == ["_meta.json", "metrics.json"]
@@ -74,24 +72,12 @@ def test_a_submit_without_a_bundle_has_a_checkpoint_of_metadata_alone(tmp_path: 
     assert (metrics.files, metrics.cyclomatic_max) == (0, 0)
 
 
-def test_a_checkpoint_of_an_earlier_version_is_read(tmp_path: Path) -> None:
-    (tmp_path / "system").mkdir()
-    (tmp_path / "system" / "policy.py").write_text("1")
-    old = {"schema_version": 1, "submit_index": 1, "status": "ok", "digest": "d", "n_episodes": 3}
-    (tmp_path / "metrics.json").write_text(json.dumps(old | {"consumed_budget": 5, "val_mean": 2.5}))
-    meta = checkpoints.read_meta(tmp_path, 8)
-    assert meta is not None
-    assert (meta.remaining_budget_before, meta.remaining_budget_after, meta.bundle) == (6, 3, "d")
-    assert checkpoints.policy_folder(tmp_path) == tmp_path / "system"
-    assert checkpoints.bundle_of(tmp_path) == bundles.snapshot(tmp_path / "system")
-
-
 def test_damaged_metadata_are_reported(tmp_path: Path) -> None:
-    assert checkpoints.read_meta(tmp_path, 8) is None
+    assert checkpoints.read_meta(tmp_path) is None
     checkpoints.write(tmp_path / "c", META, None, measured(None))
     (tmp_path / "c" / "_meta.json").write_text("{}")
     with pytest.raises(ProtocolError, match=r"_meta\.json is not a checkpoint's"):
-        checkpoints.read_meta(tmp_path / "c", 8)
+        checkpoints.read_meta(tmp_path / "c")
     with pytest.raises(BundleError, match=r"_meta\.json"):
         checkpoints.bundle_of(tmp_path / "c")
 

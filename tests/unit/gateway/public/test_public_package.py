@@ -22,7 +22,7 @@ import evopolicy as evp
 from evopolicy import _functions, _loop
 from evopolicy_common.records.policies import bundles
 
-EARLIER = Path(__file__).parents[3] / "conformance" / "protocol" / "earlier_run" / "run"
+GOLDEN_RUN = Path(__file__).parents[3] / "conformance" / "protocol" / "golden_run" / "run"
 
 
 def test_every_public_name_is_documented_and_typed() -> None:
@@ -50,7 +50,7 @@ def test_importing_it_starts_nothing() -> None:
 
 
 def test_finished_runs_are_read_as_records(tmp_path: Path) -> None:
-    shutil.copytree(EARLIER, tmp_path / "runs" / "a")
+    shutil.copytree(GOLDEN_RUN, tmp_path / "runs" / "a")
     runs = evp.load_runs(tmp_path / "runs")
     assert len(runs) == 1
     assert runs.left_out == ()
@@ -70,7 +70,7 @@ def test_finished_runs_are_read_as_records(tmp_path: Path) -> None:
 
 
 def test_unreadable_runs_are_left_out_with_the_reason(tmp_path: Path) -> None:
-    shutil.copytree(EARLIER, tmp_path / "runs" / "a")
+    shutil.copytree(GOLDEN_RUN, tmp_path / "runs" / "a")
     (tmp_path / "runs" / "b").mkdir()
     (tmp_path / "runs" / "b" / "run.json").write_text("{}")
     runs = evp.load_runs(tmp_path / "runs")
@@ -91,7 +91,7 @@ def test_a_text_in_a_table_is_no_markup() -> None:
 
 @pytest.fixture
 def run(tmp_path: Path) -> evp.Run:
-    shutil.copytree(EARLIER, tmp_path / "run")
+    shutil.copytree(GOLDEN_RUN, tmp_path / "run")
     (run,) = evp.load_runs(tmp_path / "run")
     return typing.cast(evp.Run, run)
 

@@ -1,0 +1,2 @@
+def gain(table):
+    return sum(table) / len(table) if table else 0.0
