@@ -28,7 +28,7 @@ SUBMIT = (
     "echo '# edit' >> system/policy.py; curl -sS --noproxy '*' -d '{{\"env_instances\": \"0-{last}\"}}'"
     " $EVOPOLICYGYM_SUBMIT_URL"
 )
-MODEL = 'harness = "llm"\nmodel = "m"\n[api]\nprotocol = "openai"\nbase_url = "{}/v1"\nkey = "BENCH_KEY"\n'
+MODEL = 'harness = "llm"\nmodel = "m"\n[api]\nbase_url = "{}/v1"\nkey = "BENCH_KEY"\n'
 ROWS = (
     ("random", "gym/acrobot"),
     ("replay", "gym/acrobot"),

@@ -26,16 +26,23 @@ from evopolicy_gateway.harnesses.coding_agents.configured import ConfiguredCli
 from evopolicy_gateway.harnesses.coding_agents.dialect import Dialect
 from evopolicy_gateway.harnesses.coding_agents.llm import Llm
 from evopolicy_gateway.harnesses.command import CommandHarness, RemoteHarness, ReplayHarness
-from evopolicy_gateway.harnesses.interface.agent_config import AcpTable, AgentConfig, read_agent
+from evopolicy_gateway.harnesses.interface.agent_config import PROVIDERS, AcpTable, AgentConfig, read_agent
 from evopolicy_gateway.harnesses.interface.base import Harness
 
 FORMS = (
     "evolve, random, replay:DIR, command:PROGRAM…, acp:PROGRAM…, file:AGENT.toml,",
-    "codex[:MODEL], claude-code[:MODEL], llm:openai/MODEL, llm:anthropic/MODEL, remote",
+    "codex[:MODEL], claude-code[:MODEL], llm:PROVIDER/MODEL, remote",
 )
 """Values of `--agent`, in two lines."""
 _BY_KIND = {re.split(r"[:[]", form)[0]: form for form in reversed(re.findall(r"[^, ]+", " ".join(FORMS)))}
-_MODELS = {"openai": re.compile(r"(chat)?gpt-.+|o\d.*"), "anthropic": re.compile(r"claude-.*\d.*")}
+_MODELS = {
+    "openai": re.compile(r"(chat)?gpt-.+|o\d.*"),
+    "anthropic": re.compile(r"claude-.*\d.*"),
+    "google": re.compile(r"gemini-.+"),
+    "deepseek": re.compile(r"deepseek-.+"),
+    "moonshot": re.compile(r"kimi-.+"),
+    "mistral": re.compile(r"(mistral|magistral|devstral|codestral|ministral)-.+"),
+}
 """Names of models by their providers."""
 _INTERPRETER = re.compile(r"(python|bash|sh|node|perl|ruby)[\d.]*")
 _SCRIPTS = "py|sh|js|ts|rb|pl"
@@ -123,7 +130,7 @@ def _meant(agent: str, started_in: Path) -> str | None:
 
 def _nearest(agent: str) -> str | None:
     """The form of `--agent` that a name of a model or a misspelt name was meant for."""
-    if agent.startswith(tuple(f"{provider}/" for provider in _MODELS)):
+    if agent.startswith(tuple(f"{provider}/" for provider in PROVIDERS)):
         return f"llm:{agent}"
     for provider, names in _MODELS.items():
         if names.fullmatch(agent.lower()):

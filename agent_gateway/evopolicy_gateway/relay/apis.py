@@ -10,7 +10,7 @@ from urllib.parse import urlencode, urlsplit
 
 import msgspec
 
-Protocol = Literal["openai", "anthropic"]
+Protocol = Literal["openai", "anthropic", "google"]
 
 
 _PASSED_QUERY = ("beta", "client_version", "limit")

@@ -137,7 +137,7 @@ class RunPart(msgspec.Struct, frozen=True, kw_only=True):
     group: ClassVar[str] = "Run"
 
     agent: Annotated[str, OF_ONE_RUN]
-    """evolve, random, replay:DIR, command:PROGRAM…, codex, claude-code, llm:openai/MODEL, acp:PROGRAM…,
+    """evolve, random, replay:DIR, command:PROGRAM…, codex, claude-code, llm:PROVIDER/MODEL, acp:PROGRAM…,
     file:AGENT.toml, remote"""
     budget: Count | None = None
     """Train episodes; default: the suite's."""

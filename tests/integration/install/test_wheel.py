@@ -276,7 +276,7 @@ def test_an_agent_plays_where_its_extra_alone_is_installed(built: Built, tmp_pat
     size = ("--env", "toy/line", "--budget", "2", "--validation", "1", "--heldout", "1", "--exp-id", "t")
     (tmp_path / "c").mkdir()
     with toy_cluster(tmp_path / "c") as operator, ModelApi([Step(command=SUBMIT)]) as api:
-        api_table = f'protocol = "openai"\nbase_url = "{api.base_url}/v1"\nkey = "API_KEY"\n'
+        api_table = f'base_url = "{api.base_url}/v1"\nkey = "API_KEY"\n'
         (tmp_path / "llm.toml").write_text(f'harness = "llm"\nmodel = "m"\n[api]\n{api_table}')
         agents = {"llm": "file:llm.toml", "acp": f"acp:{FAKES}/acp-agent"}
         given = {"API_KEY": KEY, "FAKE_SCENARIO": "work", "FAKE_STATE": "fake"}

@@ -141,7 +141,8 @@ class ModelApi:
         search = self._search(path, request)
         with self._lock:
             self.n_asked += 1
-            self.keys |= {handler.headers.get(name, "") for name in ("authorization", "x-api-key")} - {""}
+            names = ("authorization", "x-api-key", "x-goog-api-key")
+            self.keys |= {handler.headers.get(name, "") for name in names} - {""}
         step = Step() if search else self._next(request)
         if step.odd is not None:
             step.odd(handler, request)
@@ -191,14 +192,12 @@ class ModelApi:
         return self.script[at] if at < len(self.script) else Step(text="Nothing more to do.")
 
 
-def llm_agent(
-    folder: Path, base_url: str, protocol: str = "openai", key: str = "MODEL_ACCESS", **more: Any
-) -> str:
+def llm_agent(folder: Path, base_url: str, api: str = "chat", key: str = "MODEL_ACCESS", **more: Any) -> str:
     """`--agent` for the built-in agent with a model API at `base_url`, and further settings."""
-    base = f"{base_url}/v1" if protocol == "openai" else base_url
+    base = f"{base_url}/v1" if api in ("chat", "responses") else base_url
     usual = {"harness": "llm", "model": "m-1", "backoff_s": 0.01, "pause_s": 0.1, "max_pause_s": 0.2}
     lines = [f"{name} = {as_toml(value)}" for name, value in {**usual, **more}.items()]
-    table = f'[api]\nprotocol = "{protocol}"\nbase_url = "{base}"\nkey = "{key}"\n'
+    table = f'[api]\napi = "{api}"\nbase_url = "{base}"\nkey = "{key}"\n'
     (folder / "agent.toml").write_text("\n".join([*lines, table]))
     return f"file:{folder / 'agent.toml'}"
 
@@ -340,7 +339,7 @@ def _codex_tool(name: str, request: dict[str, Any]) -> dict[str, str] | None:
 def _shell_call(command: str, request: dict[str, Any]) -> tuple[str, dict[str, Any]]:
     """The call of whichever shell tool this version of the CLI offers."""
     offered = {tool.get("name"): tool for tool in request["tools"] if tool.get("type") == "function"}
-    for name, argument in (("exec_command", "cmd"), ("shell_command", "command")):
+    for name, argument in (("exec_command", "cmd"), ("shell_command", "command"), ("bash", "command")):
         if name in offered:
             return name, {argument: command}
     if "shell" in offered:

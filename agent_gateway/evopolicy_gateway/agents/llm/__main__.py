@@ -7,15 +7,17 @@ Exit status: 0 the turn is done, 1 it failed; the last event tells which.
 from __future__ import annotations
 
 import argparse
+import asyncio
 import ctypes
-import importlib.util
 import json
 import sys
 from importlib import metadata
 from pathlib import Path
 
+from pydantic_ai.exceptions import UserError
+
 from evopolicy_gateway.agents.llm.agent import Events, Session, play_turn
-from evopolicy_gateway.agents.llm.apis import APIS, open_api
+from evopolicy_gateway.agents.llm.conversation import ApiError, Conversation
 
 _PR_SET_DUMPABLE = 4
 
@@ -28,16 +30,20 @@ def main() -> int:
     parser.add_argument("--resume", action="store_true")
     given = parser.parse_args()
     if given.version:
-        installed = [name for name in APIS if importlib.util.find_spec(name) is not None]
-        print(", ".join(f"{name} {metadata.version(name)}" for name in installed))
+        print(f"pydantic-ai {metadata.version('pydantic-ai-slim')}")
         return 0
     # The model's commands have this process's user: without this they could read its key, and use it uncounted.
     ctypes.CDLL(None).prctl(_PR_SET_DUMPABLE, 0, 0, 0, 0)
     session = Session(Path.home() / ".evopolicy-llm" / f"{given.session}.json")
     events = Events(sys.stdout, given.session)
     order = json.load(sys.stdin)
-    api = open_api(given.settings, order["key"], session.load() if given.resume else [])
-    return play_turn(api, order["prompt"], session, events)
+    kept = session.load() if given.resume else b""
+    try:
+        conversation = Conversation(given.settings, order["key"], kept)
+    except UserError as error:  # such as a name of a model that the provider cannot have
+        events.failed(ApiError(str(error), 400, None))
+        return 1
+    return asyncio.run(play_turn(conversation, order["prompt"], session, events))
 
 
 if __name__ == "__main__":

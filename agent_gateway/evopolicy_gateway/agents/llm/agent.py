@@ -4,29 +4,28 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, TextIO
 
 from evopolicy_gateway.agents.llm import shell
-from evopolicy_gateway.agents.llm.apis import Api, ApiError, Call, Message, Reply
+from evopolicy_gateway.agents.llm.conversation import ApiError, Call, Conversation, Reply
 
 
 class Session:
-    """A conversation's messages, in a file of the agent's home."""
+    """A conversation in a file of the agent's home."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
 
-    def load(self) -> list[Message]:
-        """The messages; none when the first turn failed before anything was saved."""
-        return list(json.loads(self._path.read_text())) if self._path.exists() else []
+    def load(self) -> bytes:
+        """The conversation; empty when the first turn failed before anything was saved."""
+        return self._path.read_bytes() if self._path.exists() else b""
 
-    def save(self, messages: Sequence[Message]) -> None:
-        """Saves them; a program that is killed meanwhile leaves the earlier ones."""
+    def save(self, conversation: Conversation) -> None:
+        """Saves it; a program that is killed meanwhile leaves the earlier one."""
         self._path.parent.mkdir(parents=True, exist_ok=True)
         part = self._path.with_suffix(".part")
-        part.write_text(json.dumps(messages))
+        part.write_bytes(conversation.dumped())
         os.replace(part, self._path)
 
 
@@ -77,13 +76,13 @@ MAX_FAULTY = 5
 for it."""
 
 
-def play_turn(api: Api, prompt: str, session: Session, events: Events) -> int:
+async def play_turn(api: Conversation, prompt: str, session: Session, events: Events) -> int:
     """Plays one turn and returns the program's exit status."""
     api.say(prompt)
     n_faulty = 0
     while True:
         try:
-            reply = api.ask()
+            reply = await api.ask()
         except ApiError as failure:
             if failure.too_long and api.shorten():
                 continue
@@ -91,7 +90,7 @@ def play_turn(api: Api, prompt: str, session: Session, events: Events) -> int:
             return 1
         events.reply(reply)
         if not reply.calls:
-            session.save(api.messages)
+            session.save(api)
             events.saved()
             events.done(reply.text)
             return 0
@@ -102,8 +101,8 @@ def play_turn(api: Api, prompt: str, session: Session, events: Events) -> int:
             outputs.append(text)
             n_faulty = n_faulty + 1 if call.fault else 0
         api.answer(reply.calls, outputs)
-        # Only here every call has its answer, as both protocols require of a conversation.
-        session.save(api.messages)
+        # Only here every call has its answer, as all APIs require of a conversation.
+        session.save(api)
         events.saved()
         if n_faulty >= MAX_FAULTY:
             why = f"{n_faulty} faulty calls in a row, the last: {reply.calls[-1].fault}"

@@ -6,10 +6,10 @@ it. The API's key stays outside its jail.
 
 from __future__ import annotations
 
-import importlib.util
 import json
 import os
 import sys
+from importlib import metadata
 from typing import Any
 
 import msgspec
@@ -18,9 +18,12 @@ from evopolicy_common.errors import ConfigError
 from evopolicy_common.installation import add_extra
 from evopolicy_gateway.harnesses.coding_agents.claude_code import ClaudeReader
 from evopolicy_gateway.harnesses.coding_agents.dialect import Dialect
-from evopolicy_gateway.harnesses.interface.agent_config import AgentConfig, ApiTable
+from evopolicy_gateway.harnesses.interface.agent_config import PROVIDERS, AgentConfig, ApiTable
 from evopolicy_gateway.inputs.declared import IN_JAIL, SKILL
 
+_FORM = "--agent llm:PROVIDER/MODEL"
+_CLIENTS = {"openai": "openai", "anthropic": "anthropic", "google": "google-genai"}
+"""Distribution of the vendor's library, by the family of APIs."""
 _RETRIES = 4
 """Retries of one request by the vendor's library; a turn that fails after them is retried by the harness."""
 _TIMEOUT_S = 600.0
@@ -39,29 +42,36 @@ class Llm(Dialect):
         super().__init__(config)
         if config.api is None or not config.model:
             raise ConfigError(
-                "harness llm needs `model` and a table [api] with its `protocol`; on the command line:"
-                " --agent llm:openai/MODEL or llm:anthropic/MODEL"
+                "harness llm needs `model` and a table [api] with a `provider` or a `base_url`; on the command line:"
+                f" {_FORM}"
             )
         if config.mcp:
             raise ConfigError("harness llm starts no MCP servers; leave out [mcp], or use another harness")
         self._api: ApiTable = config.api
-        self.packages = (self._api.protocol,)
-        if importlib.util.find_spec(self._api.protocol) is None:
-            raise ConfigError(f"the agent llm needs the package {self._api.protocol}: {add_extra('llm')}")
+        self.packages = ("pydantic-ai-slim", _CLIENTS[self._api.protocol])
+        for name in self.packages:
+            with_extra = f"the agent llm needs the package {name}: {add_extra('llm')}"
+            try:
+                metadata.version(name)
+            except metadata.PackageNotFoundError:
+                raise ConfigError(with_extra) from None
 
     def arguments(self, session: str | None, *, resume: bool, prompt: str, options: str) -> list[str]:
-        version = "/v1" if self._api.protocol == "openai" else ""
+        api = self._api
+        version = "/v1" if api.protocol == "openai" else ""
         settings: dict[str, Any] = {
-            "protocol": self._api.protocol,
+            "provider": api.provider or "compatible",
+            "api": api.spoken,
             "model": self.config.model,
-            "base_url": self._api.url if self.relay is None else f"{self.relay.url}{version}",
-            "system": self._api.system,
+            "base_url": api.url if self.relay is None else f"{self.relay.url}{version}",
+            "system": api.system,
             "skills": [
                 f"{self.config.skills_at or self.skills_at}/{name}/{SKILL}" for name in self.kept.skills
             ],
-            "parameters": self._effort() | self._api.parameters,
-            "max_output_tokens": self._api.max_output_tokens,
-            "context_tokens": self._api.context_tokens,
+            "effort": self.config.effort,
+            "parameters": api.parameters,
+            "max_output_tokens": api.max_output_tokens,
+            "context_tokens": api.context_tokens,
             "retries": _RETRIES,
             "timeout_s": _TIMEOUT_S,
         }
@@ -78,21 +88,14 @@ class Llm(Dialect):
     def reader(self) -> ClaudeReader:
         return ClaudeReader()
 
-    def _effort(self) -> dict[str, Any]:
-        effort = self.config.effort
-        if effort is None:
-            return {}
-        openai = self._api.protocol == "openai"
-        return {"reasoning_effort": effort} if openai else {"output_config": {"effort": effort}}
-
 
 def config_of(rest: str) -> AgentConfig:
-    """The settings behind `--agent llm:PROTOCOL/MODEL`. Raises ConfigError for anything else."""
-    protocol, slash, model = rest.partition("/")
-    if protocol not in ("openai", "anthropic") or not slash or not model:
+    """The settings behind `--agent llm:PROVIDER/MODEL`. Raises ConfigError for anything else."""
+    provider, slash, model = rest.partition("/")
+    if provider not in PROVIDERS or not slash or not model:
         raise ConfigError(
-            f"--agent llm:{rest}: write llm:openai/MODEL or llm:anthropic/MODEL; for another endpoint that is"
-            ' compatible with one of them, use --agent file:AGENT.toml with harness = "llm" and a table [api]'
+            f"--agent llm:{rest}: write {_FORM}, with PROVIDER one of {', '.join(PROVIDERS)}; for another server, use"
+            ' --agent file:AGENT.toml with harness = "llm" and a table [api] with its base_url'
         )
-    api = msgspec.convert({"protocol": protocol}, ApiTable)
+    api = msgspec.convert({"provider": provider}, ApiTable)
     return AgentConfig(harness="llm", model=model, api=api)

@@ -6,11 +6,13 @@
 
 from __future__ import annotations
 
+import ipaddress
 import os
 import re
+import socket
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, NamedTuple
 from urllib.parse import urlsplit
 
 import msgspec
@@ -23,6 +25,9 @@ from evopolicy_gateway.relay.apis import Protocol, Upstream
 from evopolicy_gateway.relay.limits import Limits
 from evopolicy_gateway.relay.usage import Prices
 from evopolicy_gateway.workspace.prompts import Prompts
+
+ProviderName = Literal["openai", "anthropic", "google", "deepseek", "moonshot", "mistral", "openrouter"]
+ApiName = Literal["responses", "chat", "messages", "gemini"]
 
 
 class TokenPaths(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -95,12 +100,17 @@ class AcpTable(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
 class ApiTable(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """The model's API, to which the relay passes requests on."""
 
-    protocol: Protocol
-    """OpenAI's Chat Completions and Responses, or Anthropic's Messages; many other providers speak one of them."""
+    provider: ProviderName | None = None
+    """Chooses base URL, API and the variable with the key. None: a server of your own at `base_url`."""
+    api: ApiName | None = None
+    """OpenAI's Responses or Chat Completions, Anthropic's Messages, or Gemini's generateContent. None: the one of the
+    provider, and `chat` without one."""
     base_url: str = ""
-    """As the vendor's library takes it, such as `https://api.example.com/v1`; empty: the vendor's own."""
+    """As the vendor's library takes it, such as `https://api.example.com/v1`; empty: the provider's own."""
+    insecure_http: bool = False
+    """Allows `http://` to a host of the local network, by which others may read prompts, answers and the key."""
     key: str | None = None
-    """Name of the variable with the API key; None: OPENAI_API_KEY or ANTHROPIC_API_KEY; empty: none is needed."""
+    """Name of the variable with the API key; None: the provider's, such as OPENAI_API_KEY; empty: none is needed."""
     key_header: str = ""
     """Header with the key, such as `api-key` for Azure; empty: the protocol's own."""
     headers: dict[str, str] = {}
@@ -112,25 +122,73 @@ class ApiTable(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     system: str = ""
     """In place of the built-in system prompt."""
     max_output_tokens: Annotated[int, Meta(ge=1)] = 32_000
-    """Of one answer; only with the protocol anthropic, which needs it."""
+    """Of one answer; only with the API messages, which needs it."""
     context_tokens: Annotated[int, Meta(ge=1000)] = 180_000
     """A conversation with more tokens is shortened: the outputs of earlier commands are left out."""
 
     @property
+    def spoken(self) -> ApiName:
+        """The API of the built-in agent."""
+        return self.api or (PROVIDERS[self.provider].api if self.provider else "chat")
+
+    @property
+    def protocol(self) -> Protocol:
+        """The family of APIs that the relay serves."""
+        return _FAMILIES[self.spoken]
+
+    @property
     def url(self) -> str:
-        return self.base_url or _VENDORS[self.protocol][0]
+        return self.base_url or (PROVIDERS[self.provider].base_url if self.provider else "")
 
     @property
     def variable(self) -> str:
         """Name of the variable with the key; empty: none."""
-        return _VENDORS[self.protocol][2] if self.key is None else self.key
+        return PROVIDERS[self.provider or self.protocol].variable if self.key is None else self.key
+
+    def check(self) -> None:
+        """Raises ConfigError when the address is missing, or cannot be reached from a jail."""
+        if not self.url:
+            names = ", ".join(PROVIDERS)
+            raise ConfigError(f"[api] needs a provider ({names}), or the base_url of another server")
+        if _is_reachable(self.url, insecure_http=self.insecure_http):
+            return
+        if self.insecure_http:
+            way = "or http:// on this machine or at a private address, to which the host's name must lead"
+        else:
+            way = "or http:// on this machine; insecure_http = true allows http:// in the local network too"
+        raise ConfigError(f"api.base_url = {self.base_url!r}: https://HOST… is needed, {way}")
 
 
-_VENDORS: dict[Protocol, tuple[str, str, str]] = {
-    "openai": ("https://api.openai.com/v1", "OPENAI_BASE_URL", "OPENAI_API_KEY"),
-    "anthropic": ("https://api.anthropic.com", "ANTHROPIC_BASE_URL", "ANTHROPIC_API_KEY"),
+class Provider(NamedTuple):
+    """A provider of models."""
+
+    base_url: str
+    variable: str
+    """Usual name of the variable with the key."""
+    api: ApiName
+
+
+PROVIDERS: dict[ProviderName, Provider] = {
+    "openai": Provider("https://api.openai.com/v1", "OPENAI_API_KEY", "responses"),
+    "anthropic": Provider("https://api.anthropic.com", "ANTHROPIC_API_KEY", "messages"),
+    "google": Provider("https://generativelanguage.googleapis.com", "GEMINI_API_KEY", "gemini"),
+    "deepseek": Provider("https://api.deepseek.com", "DEEPSEEK_API_KEY", "chat"),
+    "moonshot": Provider("https://api.moonshot.ai/v1", "MOONSHOT_API_KEY", "chat"),
+    "mistral": Provider("https://api.mistral.ai/v1", "MISTRAL_API_KEY", "chat"),
+    "openrouter": Provider("https://openrouter.ai/api/v1", "OPENROUTER_API_KEY", "chat"),
 }
-"""Base URL, and the variables with which an agent is given another one and the key."""
+_FAMILIES: dict[ApiName, Protocol] = {
+    "responses": "openai",
+    "chat": "openai",
+    "messages": "anthropic",
+    "gemini": "google",
+}
+_BASES: dict[Protocol, str] = {
+    "openai": "OPENAI_BASE_URL",
+    "anthropic": "ANTHROPIC_BASE_URL",
+    "google": "GOOGLE_GEMINI_BASE_URL",
+}
+"""Variables with which an agent is given another base URL."""
 _OWN_APIS: dict[str, tuple[Protocol, tuple[str, ...]]] = {
     "codex": ("openai", ("CODEX_API_KEY", "OPENAI_API_KEY")),
     "claude-code": ("anthropic", ("ANTHROPIC_API_KEY", "ANTHROPIC_AUTH_TOKEN")),
@@ -142,9 +200,9 @@ _OWN_PROVIDER = ("model_provider", "openai_base_url")
 
 def relay_variables(protocol: Protocol, url: str, token: str) -> dict[str, str]:
     """Variables that lead an agent to the relay. Empty ones replace the operator's."""
-    _, base, key = _VENDORS[protocol]
     address = f"{url}/v1" if protocol == "openai" else url
-    return {base: address, key: token, **({} if protocol == "openai" else {"ANTHROPIC_AUTH_TOKEN": ""})}
+    other = {"ANTHROPIC_AUTH_TOKEN": ""} if protocol == "anthropic" else {}
+    return {_BASES[protocol]: address, PROVIDERS[protocol].variable: token, **other}
 
 
 class AgentConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -223,11 +281,8 @@ class AgentConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
                 raise ConfigError(f"api.headers: the variable {name} is not set; export it before starting")
         if self.models == "declared" and self.model is None:
             raise ConfigError('models = "declared" needs `model`')
-        if self.api is not None and not _is_reachable(self.api.url):
-            raise ConfigError(
-                f"api.base_url = {self.api.url!r}: https://HOST… is needed, or http:// on this machine (localhost,"
-                " 127.0.0.1)"
-            )
+        if self.api is not None:
+            self.api.check()
         for name in ("backoff_s", "silence_s", "pause_s"):
             if not 0.0 < getattr(self, name) < float("inf"):
                 raise ConfigError(f"{name} = {getattr(self, name)}: must be a number of seconds above 0")
@@ -270,7 +325,7 @@ class AgentConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
             return None
         protocol, names = _OWN_APIS[self.harness]
         variable = next((name for name in names if variables.get(name)), None)
-        base = variables.get(_VENDORS[protocol][1]) or _VENDORS[protocol][0]
+        base = variables.get(_BASES[protocol]) or PROVIDERS[protocol].base_url
         own = any(word in argument for argument in self.extra_args for word in _OWN_PROVIDER)
         if variable is None or own or not _is_reachable(base):
             return None
@@ -291,15 +346,23 @@ class AgentConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
         return {name: value for name, value in kept.items() if value not in (None, [], {})}
 
 
-def _is_reachable(url: str) -> bool:
-    """Whether a jail can reach the URL: by TLS through its proxy, or a port of this machine."""
+def _is_reachable(url: str, *, insecure_http: bool = False) -> bool:
+    """Whether a jail can reach the URL: by TLS through its proxy, or a port of this machine. `insecure_http`: or, by
+    plain HTTP, a host all of whose addresses are private."""
     try:
         parts = urlsplit(url)
-        parts.port  # noqa: B018
+        port = parts.port
     except ValueError:
         return False
-    local = parts.hostname in ("localhost", "127.0.0.1")
-    return bool(parts.hostname) and (parts.scheme == "https" or (parts.scheme == "http" and local))
+    if not parts.hostname or parts.scheme != "http":
+        return bool(parts.hostname) and parts.scheme == "https"
+    if parts.hostname in ("localhost", "127.0.0.1") or not insecure_http:
+        return parts.hostname in ("localhost", "127.0.0.1")
+    try:
+        found = socket.getaddrinfo(parts.hostname, port or 80, type=socket.SOCK_STREAM)
+    except OSError:
+        return False
+    return all(ipaddress.ip_address(str(each[4][0]).partition("%")[0]).is_private for each in found)
 
 
 def read_agent(path: Path) -> AgentConfig:

@@ -57,7 +57,7 @@ def main() -> None:
     shutil.rmtree(AT, ignore_errors=True)
     AT.mkdir()
     with ModelApi(SCRIPT) as api:
-        table = f'[api]\nprotocol = "openai"\nbase_url = "{api.base_url}/v1"\nkey = "MODEL_ACCESS"\n'
+        table = f'[api]\nbase_url = "{api.base_url}/v1"\nkey = "MODEL_ACCESS"\n'
         (AT / "agent.toml").write_text(f'harness = "llm"\nmodel = "m-1"\n{table}')
         arguments = ["local", "--env", "gymnasium/CliffWalking-v1", "--agent", f"file:{AT}/agent.toml"]
         arguments += ["--entry", "recorded", "--exp-id", "first", "--record-model", "full"]

@@ -55,15 +55,15 @@ def test_an_agent_behind_the_protocol_plays_a_whole_run_in_its_jail(
 
 
 @pytest.mark.system
-@pytest.mark.parametrize("protocol", ["openai", "anthropic"])
+@pytest.mark.parametrize("api_name", ["chat", "messages"])
 def test_a_model_with_a_shell_plays_a_whole_run_in_its_jail(
-    tmp_path: Path, protocol: str, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, api_name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("MODEL_ACCESS", KEY)
     script = [Step(PROBE), Step(SUBMIT), Step(text="a first try"), Step(SUBMIT), Step(text="done")]
     with ModelApi(script) as api, ModelApi([]) as side:
         more = {"prices": {"input": 1.0, "output": 10.0}, "environment": {"SIDE": side.base_url}}
-        agent = llm_agent(tmp_path, api.base_url, protocol, **more)
+        agent = llm_agent(tmp_path, api.base_url, api_name, **more)
         record, _ = played_here(tmp_path, agent)
     folder = run_dir(tmp_path)
     assert (record.jail, record.outcome.budget_used, record.agent.harness) == ("bwrap", 4, "llm")

@@ -68,13 +68,13 @@ def used_in(record: RunRecord) -> tuple[ModelUse, Tokens]:
 
 
 def played(
-    folder: Path, operator: Path, script: list[Step], protocol: str = "openai", **more: Any
+    folder: Path, operator: Path, script: list[Step], api_name: str = "chat", **more: Any
 ) -> tuple[RunRecord, ModelApi, str]:
     """The record of a run, the API that it used, and what the command said."""
     with (
         ModelApi(script) as api,
         command(
-            folder, *run_arguments(operator, llm_agent(folder, api.base_url, protocol, **more))
+            folder, *run_arguments(operator, llm_agent(folder, api.base_url, api_name, **more))
         ) as running,
     ):
         running.wait()
@@ -105,15 +105,15 @@ def test_odd_answers_are_counted_as_they_were_given(tmp_path: Path, operator: Pa
     assert KEY not in text
 
 
-@pytest.mark.parametrize("protocol", ["openai", "anthropic"])
-def test_the_key_is_nowhere_in_the_jail(tmp_path: Path, operator: Path, protocol: str) -> None:
+@pytest.mark.parametrize("api_name", ["chat", "messages"])
+def test_the_key_is_nowhere_in_the_jail(tmp_path: Path, operator: Path, api_name: str) -> None:
     """Attack: searches every file and process of its jail for the key. Defence: the key is in the relay
     alone; an answer that repeats it is changed."""
     base = json.dumps(os.path.realpath(os.sys.base_prefix))  # type: ignore[attr-defined]
     search = f"cat > /tmp/s.py <<'E'\nBASE = {base}\n{SEARCH}\nE\npython3 -P /tmp/s.py; env"
-    record, api, _ = played(tmp_path, operator, [Step(command=search), *ENDS], protocol)
+    record, api, _ = played(tmp_path, operator, [Step(command=search), *ENDS], api_name)
     assert used_in(record)[0].requests == api.n_asked == 5
-    assert api.keys == {KEY if protocol == "anthropic" else f"Bearer {KEY}"}
+    assert api.keys == {KEY if api_name == "messages" else f"Bearer {KEY}"}
     sent = json.dumps(api.requests[1])
     assert "searched 0 []" in sent
     assert "EVOPOLICYGYM_SUBMIT_URL" in sent
@@ -247,15 +247,15 @@ class Policy:
 EDIT = Step(command=f"echo '{LUCK}' > system/policy.py; pwd; date; ls -l; cat AGENTS.md feedback/*/*")
 
 
-@pytest.mark.parametrize("protocol", ["openai", "anthropic"])
+@pytest.mark.parametrize("api_name", ["chat", "messages"])
 def test_a_recorded_agent_replays_to_the_byte_without_its_model(
-    tmp_path: Path, operator: Path, protocol: str, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, operator: Path, api_name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Attack: hands over a run directory that names programs, which `evopolicy replay` would run. Defence:
     `.replay.json` has an authentication code by a key of the user; without it, `--trust` is needed."""
     script = [EDIT, SUBMIT, EDIT, Step(odd=odd_answers.busy(429, retry_after="0")), *ENDS[1:]]
     with ModelApi(script) as api:
-        arguments = run_arguments(operator, llm_agent(tmp_path, api.base_url, protocol))
+        arguments = run_arguments(operator, llm_agent(tmp_path, api.base_url, api_name))
         with command(tmp_path, *arguments, "--record-model", "full") as running:
             assert running.wait() == 0, running.text
     monkeypatch.delenv("MODEL_ACCESS")

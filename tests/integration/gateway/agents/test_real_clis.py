@@ -154,7 +154,7 @@ def test_the_relay_counts_for_a_real_cli_which_never_has_the_key(
         name = {"claude-code": "claude"}.get(harness, harness.removesuffix("-acp"))
         more: dict[str, Any] = {"program": (f"{CLIS}/{name}",)}
         if name == "qwen":
-            more |= {"api": ApiTable(protocol="openai", base_url=f"{api.base_url}/v1")}
+            more |= {"api": ApiTable(base_url=f"{api.base_url}/v1")}
             more |= {"cli": read_agent(AGENTS / "qwen.toml").cli}
         if harness == "qwen-acp":
             program = (*more["program"], "--acp", "--model", "gpt-5.5", "--auth-type", "openai")

@@ -17,7 +17,6 @@ from stages.declared_inputs import DESCRIPTION, declare
 
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.records.run_record import inputs_digest
-from evopolicy_gateway.agents.llm.apis import open_api
 from evopolicy_gateway.harnesses import make
 from evopolicy_gateway.harnesses.coding_agents.cli_agent import CliAgent
 from evopolicy_gateway.harnesses.interface.agent_config import AcpTable, AgentConfig, Cli
@@ -232,11 +231,13 @@ def test_skills_are_where_the_agent_looks_for_them(tmp_path: Path, program: str,
 
 
 def test_the_built_in_agent_tells_its_model_when_to_read_a_skill(tmp_path: Path) -> None:
-    pytest.importorskip("openai")
+    Conversation = pytest.importorskip("evopolicy_gateway.agents.llm.conversation").Conversation  # noqa: N806
     declare(tmp_path)
     path = str(tmp_path / "skills/lamps/SKILL.md")
     settings: dict[str, Any] = {
-        "protocol": "openai",
+        "provider": "openai",
+        "api": "responses",
+        "effort": None,
         "model": "m",
         "base_url": "",
         "system": "",
@@ -244,7 +245,7 @@ def test_the_built_in_agent_tells_its_model_when_to_read_a_skill(tmp_path: Path)
     }
     settings |= {"parameters": {}, "max_output_tokens": 10, "context_tokens": 1000, "retries": 0}
     settings["timeout_s"] = 1.0
-    system = open_api(settings, "key", [])._system
+    system = Conversation(settings, "key")._system
     assert path in system
     assert DESCRIPTION in system
     assert "Read the lamp twice" not in system

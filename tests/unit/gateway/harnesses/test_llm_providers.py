@@ -1,0 +1,281 @@
+"""The built-in agent's conversation with each provider, on servers that follow the documented rules or break them."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import pytest
+from stages.provider_api import (
+    CACHED,
+    FRESH,
+    OUTPUT,
+    Document,
+    ProviderApi,
+    Said,
+    Sends,
+    chat_chunk,
+    chat_usage,
+)
+
+from evopolicy_gateway.agents.llm.conversation import ApiError, Conversation, Reply
+from evopolicy_gateway.harnesses.interface.agent_config import PROVIDERS, ApiName, ProviderName
+
+pytestmark = pytest.mark.slow
+
+apis = pytest.mark.parametrize("api", ["chat", "responses", "messages", "gemini"])
+SCRIPT = [
+    Said(text="I look.", commands=("ls", "pwd"), reasoning="two\n\nthings "),
+    Said(commands=("cat x",), reasoning="and this"),
+    Said(text=" <think>no reasoning</think> Half done."),
+    Said(text="Done.", reasoning="enough"),
+]
+SPENT = {
+    "input_tokens": FRESH,
+    "cache_read_input_tokens": CACHED,
+    "cache_creation_input_tokens": 0,
+    "output_tokens": OUTPUT,
+}
+
+
+async def conversed(
+    server: ProviderApi, api: str, n: int, provider: str = "compatible", **more: Any
+) -> list[Reply]:
+    """The replies of a conversation that is begun anew from what was kept before each request."""
+    settings: dict[str, Any] = {"api": api, "provider": provider, "model": "m-1", "system": ""}
+    settings |= {
+        "base_url": server.base_url,
+        "effort": None,
+        "parameters": {},
+        "retries": 0,
+        "timeout_s": 9.0,
+    }
+    settings |= {"context_tokens": 1000, "max_output_tokens": 9, **more}
+    replies, kept, outputs = [], b"", 0
+    for _ in range(n):
+        conversation = Conversation(settings, "key", kept)
+        if not outputs:
+            conversation.say("Go on.")
+        reply = await conversation.ask()
+        outputs = len(reply.calls)
+        if outputs:
+            conversation.answer(reply.calls, ["an output"] * outputs)
+        replies.append(reply)
+        kept = conversation.dumped()
+    return replies
+
+
+def said(replies: list[Reply]) -> list[tuple[str, tuple[str, ...]]]:
+    assert not any(call.fault for reply in replies for call in reply.calls)
+    return [(reply.text, tuple(call.command for call in reply.calls)) for reply in replies]
+
+
+WHOLE = [(one.text, one.commands) for one in SCRIPT]
+
+
+@apis
+async def test_a_providers_messages_come_back_unchanged_after_each_restart(api: ApiName) -> None:
+    with ProviderApi(api, SCRIPT) as server:
+        replies = await conversed(server, api, 4)
+    assert said(replies) == WHOLE
+    assert [reply.usage for reply in replies] == [SPENT] * 4
+    assert [request["stream"] for request in server.requests] == [True] * 4
+
+
+@pytest.mark.parametrize("provider", PROVIDERS)
+async def test_each_provider_by_its_name(provider: ProviderName) -> None:
+    api = PROVIDERS[provider].api
+    with ProviderApi("openrouter" if provider == "openrouter" else api, SCRIPT) as server:
+        assert said(await conversed(server, api, 4, provider, model="maker/m-1")) == WHOLE
+
+
+@apis
+async def test_a_request_is_the_same_each_time(api: ApiName) -> None:
+    requests = []
+    for _ in range(2):
+        with ProviderApi(api, SCRIPT) as server:
+            await conversed(server, api, 4)
+        requests.append(server.requests)
+    assert requests[0] == requests[1]
+
+
+@pytest.mark.parametrize("api", ["chat", "responses", "messages"])
+async def test_a_server_without_streams_is_asked_for_whole_answers(api: ApiName) -> None:
+    with ProviderApi(api, SCRIPT, streams=False) as server:
+        assert said(await conversed(server, api, 4)) == WHOLE
+    # Only the first stream was tried, also after the restarts.
+    assert [bool(request["stream"]) for request in server.requests] == [True, *[False] * 4]
+
+
+Calls = Callable[[list[Document]], Iterator[Document]]
+
+
+def in_pieces(index: int | None) -> Calls:
+    """Each call in two chunks, all with this index."""
+
+    def chunks(calls: list[Document]) -> Iterator[Document]:
+        at = {} if index is None else {"index": index}
+        for call in calls:
+            name, given = call["function"]["name"], call["function"]["arguments"]
+            begun = {**call, "function": {"name": name, "arguments": given[:4]}}
+            yield chat_chunk({"tool_calls": [begun | at]})
+            yield chat_chunk({"tool_calls": [at | {"function": {"arguments": given[4:]}}]})
+
+    return chunks
+
+
+def nulls(calls: list[Document]) -> Iterator[Document]:
+    yield chat_chunk(None)
+    yield {"id": "c", "object": "chat.completion.chunk", "choices": None}
+    yield chat_chunk({"tool_calls": [call | {"index": at} for at, call in enumerate(calls)], "content": None})
+    yield chat_chunk(None, "tool_calls")
+
+
+def streaming(chunks: Calls) -> Sends:
+    """Streams the calls in chunks of another form; whole answers are as usual."""
+
+    def sends(provider: ProviderApi, handler: Any, request: Document, said: Said) -> bool:
+        if not said.commands or not request.get("stream"):
+            return False
+        message = provider.took(said)
+        texts = {name: message[name] for name in ("content", "reasoning_content") if message.get(name)}
+        usage = {
+            "id": "c",
+            "object": "chat.completion.chunk",
+            "created": 1,
+            "choices": [],
+            "usage": chat_usage(),
+        }
+        calls = chunks(message["tool_calls"])
+        handler.stream(iter([chat_chunk(texts), *calls, chat_chunk({}, "tool_calls"), usage]))
+        return True
+
+    return sends
+
+
+def changing(change: Callable[[Document], Any], *, ids: bool = True) -> Sends:
+    """Changes each call of an answer, of a whole one and of a stream."""
+
+    def sends(provider: ProviderApi, handler: Any, request: Document, said: Said) -> bool:
+        message = provider.took(said, ids=ids)
+        calls = json.loads(json.dumps(message.get("tool_calls", [])))
+        for call, known in zip(calls, message.get("tool_calls", []), strict=True):
+            change(call)
+            if isinstance(given := call["function"]["arguments"], dict):
+                known["function"]["arguments"] = json.dumps(given, separators=(",", ":"))
+        sent = message | ({"tool_calls": calls} if calls else {})
+        if request.get("stream"):
+            handler.stream(provider.events(sent, said, "m-1"))
+        else:
+            handler.send(200, provider.document(sent, said, "m-1"))
+        return True
+
+    return sends
+
+
+def as_object(call: Document) -> None:
+    call["function"]["arguments"] = json.loads(call["function"]["arguments"])
+
+
+@pytest.mark.parametrize(
+    ("sends", "n_more"),
+    [
+        (streaming(in_pieces(0)), 1),
+        (streaming(in_pieces(None)), 0),
+        (streaming(nulls), 0),
+        (changing(lambda call: call["function"].pop("name")), 1),
+        (changing(lambda call: call["function"].update(name=None)), 1),
+        (changing(lambda call: call.update(id=None), ids=False), 0),
+        (changing(lambda call: None, ids=False), 0),
+        (changing(as_object), 0),
+    ],
+    ids=["one index", "no index", "nulls", "no name", "null as name", "null as id", "no id", "object"],
+)
+async def test_calls_in_another_form_are_understood(sends: Sends, n_more: int) -> None:
+    """`n_more`: requests without a stream, after one that could not be used."""
+    with ProviderApi("chat", SCRIPT, sends=sends) as server:
+        assert said(await conversed(server, "chat", 4)) == WHOLE
+    assert len(server.requests) == 4 + n_more
+
+
+def refusing_stream_options(request: Document) -> tuple[int, Any] | None:
+    """As Mistral and others whose schema is closed."""
+    fault = {
+        "type": "extra_forbidden",
+        "loc": ["body", "stream_options"],
+        "msg": "Extra inputs are not permitted",
+    }
+    return (422, {"detail": [fault]}) if "stream_options" in request else None
+
+
+async def test_a_refused_option_of_streams_is_left_out() -> None:
+    with ProviderApi("chat", SCRIPT, refuses=refusing_stream_options) as server:
+        assert said(await conversed(server, "chat", 4, "mistral")) == WHOLE
+    assert len(server.requests) == 5
+
+
+def without_reasoning_in_chat(request: Document) -> tuple[int, Any] | None:
+    """As OpenAI's newest models: tools and reasoning together only in Responses."""
+    if "messages" in request and request.get("reasoning_effort") != "none":
+        words = "Function tools with reasoning are not supported in /v1/chat/completions. Use /v1/responses."
+        return 400, {"error": {"message": words, "type": "invalid_request_error", "code": None}}
+    return None
+
+
+async def test_openais_models_reason_with_tools_over_responses() -> None:
+    with ProviderApi("responses", SCRIPT, refuses=without_reasoning_in_chat) as server:
+        assert said(await conversed(server, PROVIDERS["openai"].api, 4, "openai", effort="high")) == WHOLE
+    assert server.requests[0]["reasoning"]["effort"] == "high"
+    # Nothing is kept at the provider: reasoning comes and goes encrypted.
+    assert (server.requests[0]["store"], server.requests[0]["include"]) == (
+        False,
+        ["reasoning.encrypted_content"],
+    )
+
+
+@pytest.mark.parametrize(
+    ("api", "field", "value"),
+    [
+        ("chat", "reasoning_effort", "high"),
+        ("messages", "output_config", {"effort": "high"}),
+        (
+            "gemini",
+            "generationConfig",
+            {"responseModalities": ["TEXT"], "thinkingConfig": {"thinking_level": "HIGH"}},
+        ),
+    ],
+)
+async def test_effort_and_further_parameters_are_in_each_request(
+    api: ApiName, field: str, value: Any
+) -> None:
+    with ProviderApi(api, SCRIPT) as server:
+        await conversed(server, api, 1, effort="high", parameters={"own": 7})
+    assert (server.requests[0][field], server.requests[0]["own"]) == (value, 7)
+
+
+@pytest.mark.parametrize("streamed", [True, False])
+async def test_an_error_in_a_success_is_told_in_the_servers_words(streamed: bool) -> None:
+    error = {"error": {"message": "the backend fell over", "code": 502}}
+
+    def sends(provider: ProviderApi, handler: Any, request: Document, said: Said) -> bool:
+        if streamed:
+            handler.stream(iter([error]))
+        else:
+            handler.send(200, error)
+        return True
+
+    with (
+        ProviderApi("chat", SCRIPT, sends=sends) as server,
+        pytest.raises(ApiError, match="backend fell over"),
+    ):
+        await conversed(server, "chat", 1)
+
+
+async def test_the_words_in_a_list_of_errors_are_told() -> None:
+    words = "Function call is missing a thought_signature"
+    error = [{"error": {"code": 400, "message": words, "status": "INVALID_ARGUMENT"}}]
+    known = pytest.raises(ApiError, match=f"^{words}$")
+    with ProviderApi("chat", SCRIPT, refuses=lambda request: (400, error)) as server, known as raised:
+        await conversed(server, "chat", 1)
+    assert raised.value.status == 400
