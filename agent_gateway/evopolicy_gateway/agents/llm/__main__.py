@@ -14,11 +14,6 @@ import sys
 from importlib import metadata
 from pathlib import Path
 
-from pydantic_ai.exceptions import UserError
-
-from evopolicy_gateway.agents.llm.agent import Events, Session, play_turn
-from evopolicy_gateway.agents.llm.conversation import ApiError, Conversation
-
 _PR_SET_DUMPABLE = 4
 
 
@@ -34,6 +29,10 @@ def main() -> int:
         return 0
     # The model's commands have this process's user: without this they could read its key, and use it uncounted.
     ctypes.CDLL(None).prctl(_PR_SET_DUMPABLE, 0, 0, 0, 0)
+    # The import takes seconds, which the version does not need.
+    from evopolicy_gateway.agents.llm.agent import Events, Session, play_turn
+    from evopolicy_gateway.agents.llm.conversation import ApiError, Conversation, UserError
+
     session = Session(Path.home() / ".evopolicy-llm" / f"{given.session}.json")
     events = Events(sys.stdout, given.session)
     order = json.load(sys.stdin)
@@ -41,7 +40,7 @@ def main() -> int:
     try:
         conversation = Conversation(given.settings, order["key"], kept)
     except UserError as error:  # such as a name of a model that the provider cannot have
-        events.failed(ApiError(str(error), 400, None))
+        events.failed(ApiError(str(error), 400))
         return 1
     return asyncio.run(play_turn(conversation, order["prompt"], session, events))
 

@@ -71,15 +71,18 @@ class Events:
         print(json.dumps(event), file=self._out, flush=True)
 
 
-MAX_FAULTY = 5
-"""Faulty calls in a row that end a turn: a model that has not understood the tool would go on without end, and be paid
-for it."""
+MAX_FAULTY = 3
+"""Faulty answers in a row that end a turn: a model that has not understood the tool would go on without end, and be
+paid for it."""
+_TOLD, _MAX_SAME = 5, 10
+"""How often the same command with the same output comes in a row until the model is told, and until the turn ends."""
 
 
 async def play_turn(api: Conversation, prompt: str, session: Session, events: Events) -> int:
     """Plays one turn and returns the program's exit status."""
     api.say(prompt)
-    n_faulty = 0
+    n_faulty = n_same = 0
+    last: tuple[str, str] | None = None
     while True:
         try:
             reply = await api.ask()
@@ -89,24 +92,35 @@ async def play_turn(api: Conversation, prompt: str, session: Session, events: Ev
             events.failed(failure)
             return 1
         events.reply(reply)
-        if not reply.calls:
-            session.save(api)
-            events.saved()
-            events.done(reply.text)
-            return 0
         outputs: list[str] = []
         for call in reply.calls:
-            text, succeeded = (call.fault, False) if call.fault else shell.run(call.command, call.timeout_s)
+            fault = call.fault and (reply.fault or call.fault)
+            text, succeeded = (fault, False) if fault else shell.run(call.command, call.timeout_s)
+            n_same = n_same + 1 if (call.command, text) == last else 1
+            last = (call.command, text)
+            if n_same >= _TOLD and not fault:
+                text += f"\n[This was the {n_same}th time in a row with this output. Do something else.]"
             events.output(call, text, succeeded=succeeded)
             outputs.append(text)
-            n_faulty = n_faulty + 1 if call.fault else 0
-        api.answer(reply.calls, outputs)
+        faults = [reply.fault] if not reply.calls else [call.fault for call in reply.calls]
+        n_faulty = n_faulty + 1 if all(faults) else 0
+        if reply.calls:
+            api.answer(reply.calls, outputs)
         # Only here every call has its answer, as all APIs require of a conversation.
         session.save(api)
         events.saved()
-        if n_faulty >= MAX_FAULTY:
-            why = f"{n_faulty} faulty calls in a row, the last: {reply.calls[-1].fault}"
-            events.failed(ApiError(why, None, None))
+        why = f"{n_faulty} faulty answers in a row, the last: {reply.fault or faults[-1]}"
+        if n_same >= _MAX_SAME and not n_faulty:
+            why = f"{n_same} times in a row the same command with the same output: {last and last[0]}"
+        elif n_faulty < MAX_FAULTY:
+            why = ""
+        if why:
+            events.failed(ApiError(why))
             return 1
+        if not reply.calls and not reply.fault:
+            events.done(reply.text)
+            return 0
+        if not reply.calls:
+            api.say(f"[{reply.fault}]")
         if reply.context > api.context_tokens:
             api.shorten()

@@ -6,6 +6,7 @@ be used is asked for once more without streaming, and so are the later ones if t
 
 from __future__ import annotations
 
+import difflib
 import json
 import re
 import warnings
@@ -15,6 +16,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from pydantic_ai import exceptions as errors
+from pydantic_ai.exceptions import UserError as UserError
 from pydantic_ai.messages import (
     ModelMessage,
     ModelMessagesTypeAdapter,
@@ -50,6 +52,18 @@ _TOO_LONG = re.compile(
 )
 _MERGED = re.compile(rf"({shell.NAME}){{2,}}")
 """The name of several calls that a stream gave the same index."""
+_AS_TEXT = re.compile(
+    r"<tool_call>|<\|tool_calls?|<function=|<function_call|\[TOOL_CALLS\]|\A\W*(json)?\W*\{\s*\"(name|command)\""
+)
+_CALL_IN_TEXT = (
+    "the model wrote a call of the tool as text: the server's tool parser is off, or not that of the model (of vLLM:"
+    " --enable-auto-tool-choice --tool-call-parser NAME)"
+)
+_CUT = "the answer was cut at its length; write less in one answer (api.max_output_tokens, or the server's own limit)"
+_NO_TOOLS = re.compile(
+    r"tool.{0,60}(support|enabl|allow|requires|parser)|(support|enabl|allow).{0,60}tool", re.I
+)
+_MAX_NAMES = 20
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -72,6 +86,8 @@ class Reply:
 
     text: str
     calls: tuple[Call, ...]
+    fault: str = ""
+    """Why it is neither an end of the turn nor calls of the tool."""
     usage: dict[str, int]
     """Tokens by the names of Anthropic's Messages; `input_tokens` without cached ones."""
 
@@ -84,15 +100,17 @@ class Reply:
 class ApiError(Exception):
     """A request failed for good; the vendor's library has retried what can be retried."""
 
-    def __init__(self, message: str, status: int | None, retry_after_s: float | None) -> None:
+    def __init__(
+        self,
+        message: str,
+        status: int | None = None,
+        retry_after_s: float | None = None,
+        *,
+        too_long: bool = False,
+    ) -> None:
+        """`too_long`: whether the conversation exceeds the model's context."""
         super().__init__(message)
-        self.status = status
-        self.retry_after_s = retry_after_s
-
-    @property
-    def too_long(self) -> bool:
-        """Whether the conversation exceeds the model's context."""
-        return self.status in (400, 413) and _TOO_LONG.search(str(self)) is not None
+        self.status, self.retry_after_s, self.too_long = status, retry_after_s, too_long
 
 
 class _AsSent(ToolCallPart):  # type: ignore[misc]
@@ -108,7 +126,8 @@ class Conversation:
     def __init__(self, settings: dict[str, Any], key: str, kept: bytes = b"") -> None:
         """`settings`: made by `harnesses/coding_agents/llm.py`. `kept`: an earlier conversation, from `dumped`."""
         self.context_tokens = int(settings["context_tokens"])
-        self._model, self._settings = opened(settings, key)
+        self._model, self._settings, self._listed = opened(settings, key)
+        self._of = settings
         saved = json.loads(kept or "{}")
         self._streams = bool(saved.get("streams", True))
         self.messages: list[ModelMessage] = ModelMessagesTypeAdapter.validate_python(
@@ -137,14 +156,13 @@ class Conversation:
             if not response.parts and response.finish_reason is None:
                 raise ValueError("it says nothing")
         except errors.ModelHTTPError as error:
-            raise ApiError(_words(error.body) or str(error), error.status_code, error.retry_after) from error
+            raise await self._told(error) from error
         except errors.ModelConnectionError as error:
-            raise ApiError(f"the connection failed: {error}", None, None) from error
+            raise ApiError(f"the connection failed: {error}") from error
         except Exception as error:
             # An answer that is none of this API leaves the libraries as errors of any kind.
             text = str(error).partition("\n")[0]
-            why = f"the model's answer cannot be read: {type(error).__name__}: {text}"
-            raise ApiError(why, None, None) from error
+            raise ApiError(f"the model's answer cannot be read: {type(error).__name__}: {text}") from error
         made = []
         for n, part in enumerate(_parts([response], ToolCallPart)):
             part.__class__ = _AsSent
@@ -156,7 +174,31 @@ class Conversation:
                 part.args = {}  # some endpoints refuse anything else for good
         self.messages.append(response)
         text = "\n".join(part.content for part in _parts([response], TextPart))
-        return Reply(text=text, calls=tuple(made), usage=_usage(response))
+        cut = _CUT if response.finish_reason == "length" else ""
+        as_text = _CALL_IN_TEXT if not made and _AS_TEXT.search(text) else ""
+        return Reply(text=text, calls=tuple(made), usage=_usage(response), fault=cut or as_text)
+
+    async def _told(self, error: errors.ModelHTTPError) -> ApiError:
+        """The error in words that say what to do."""
+        words, status = _words(error.body) or str(error), error.status_code
+        too_long = isinstance(error, errors.ModelContextWindowExceededError)
+        if too_long or (status in (400, 413) and _TOO_LONG.search(words)):
+            why = f"the conversation is longer than the model's context, set context_tokens below it: {words}"
+            return ApiError(why, status, too_long=True)
+        if isinstance(error, errors.ModelQuotaExceededError):
+            words = f"quota exceeded: {words}"
+        elif isinstance(error, errors.ModelAuthenticationError):
+            words = (
+                f"the provider does not accept the key in {self._of['variable'] or 'no variable'}: {words}"
+            )
+        elif status in (400, 404, 422, 501) and _NO_TOOLS.search(words):
+            words = f"the model or its server takes no tools, which the agent needs: {words}"
+        elif isinstance(error, errors.ModelNotFoundError):
+            names = await self._listed()
+            near = difflib.get_close_matches(self._of["model"], names, _MAX_NAMES, 0.0)
+            listed = f"; the server lists {', '.join(near)}" if near else ""
+            words = f"there is no model {self._of['model']} for this key: {words}{listed}"
+        return ApiError(words, status, error.retry_after)
 
     async def _response(self) -> ModelResponse:
         request = (self.messages, self._settings, self._known)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import json
 import re
+from collections.abc import Awaitable, Callable
 from functools import partial
 from typing import Any
 
@@ -21,19 +22,38 @@ from pydantic_ai.settings import ModelSettings
 from evopolicy_gateway.agents.llm import shell
 
 Opened = tuple[Model[Any], ModelSettings]
+_MAX_LISTED = 2000
 
 _PROFILE = ModelProfile(thinking_tags=("\0", "\0"), ignore_streamed_leading_whitespace=False)
 """Text is not split at `<think>`, so that it goes back as it came."""
 _WITHOUT_REASONING = re.compile(r"(chat)?gpt-[34]")
 
 
-def opened(settings: dict[str, Any], key: str) -> Opened:
-    """The model, and the settings of each request. `settings`: made by `harnesses/coding_agents/llm.py`."""
+def opened(
+    settings: dict[str, Any], key: str
+) -> tuple[Model[Any], ModelSettings, Callable[[], Awaitable[list[str]]]]:
+    """The model, the settings of each request, and a function that asks the server for the names of its models.
+    `settings`: made by `harnesses/coding_agents/llm.py`."""
     http = httpx2.AsyncClient(
         timeout=settings["timeout_s"], trust_env=False, event_hooks={"response": [_mended]}
     )
     opens = {"messages": _messages, "gemini": _gemini}.get(settings["api"], _openai)
-    return opens(settings, key or "none", http)
+    return (*opens(settings, key or "none", http), partial(_listed, settings, key, http))
+
+
+async def _listed(settings: dict[str, Any], key: str, http: httpx2.AsyncClient) -> list[str]:
+    """The names of the server's models; none where it does not tell them."""
+    version = {"messages": "/v1", "gemini": "/v1beta"}.get(settings["api"], "")
+    headers = {"authorization": f"Bearer {key}", "x-api-key": key, "x-goog-api-key": key}
+    if settings["api"] != "messages":
+        del headers["x-api-key"]
+    try:
+        answer = await http.get(f"{settings['base_url'].rstrip('/')}{version}/models", headers=headers)
+        document = answer.json()
+        listed = document.get("data") or document.get("models") or []
+        return [str(one.get("id") or one["name"]).removeprefix("models/") for one in listed[:_MAX_LISTED]]
+    except (httpx2.HTTPError, ValueError, LookupError, TypeError, AttributeError):
+        return []
 
 
 def _messages(settings: dict[str, Any], key: str, http: httpx2.AsyncClient) -> Opened:

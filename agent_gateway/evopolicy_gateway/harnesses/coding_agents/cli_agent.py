@@ -73,7 +73,7 @@ class CliAgent(Harness):
         self._failures = 0
         """Failed turns since the last completed one."""
         self._faulty = 0
-        """Turns in a row that ended by faulty calls."""
+        """Turns in a row that ended by faulty answers."""
         self._pause_s = self._config.pause_s
 
     def take(self, kept: Kept) -> None:

@@ -69,6 +69,7 @@ class Llm(Dialect):
                 f"{self.config.skills_at or self.skills_at}/{name}/{SKILL}" for name in self.kept.skills
             ],
             "effort": self.config.effort,
+            "variable": api.variable,
             "parameters": api.parameters,
             "max_output_tokens": api.max_output_tokens,
             "context_tokens": api.context_tokens,

@@ -1,10 +1,11 @@
 """Kinds of failed turns, and their consequences: rules without I/O.
 
 - `passing`: a crash, a timeout, or an error of the provider that a retry may resolve.
-- `quota`: the account's limit is reached; only time helps, so the run pauses.
+- `quota`: the account's limit is reached; only time helps, so the run pauses until the stated time.
 - `lost`: the CLI no longer knows the session; a new one is started.
-- `final`: a retry would fail in the same way (a wrong key, an unknown model), so the run ends.
-- `faulty`: the model called its tools wrongly, again and again; after two such turns in a row the run ends.
+- `final`: a retry would fail in the same way (a wrong key, an unknown model, an account without money): the run ends.
+- `faulty`: the model called its tools wrongly or repeated itself, again and again; after two such turns in a row the
+  run ends.
 - `cap`: the run has used up its limit of tokens or money.
 """
 
@@ -14,7 +15,9 @@ import math
 import re
 import time
 from collections.abc import Sequence
+from datetime import datetime
 from typing import Literal
+from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
 
 import msgspec
 
@@ -25,7 +28,7 @@ _MAX_MESSAGE = 500
 _MAX_SEARCHED = 20_000
 """Characters of a message that are searched for a waiting time."""
 
-_FAULTY = re.compile(r"\d+ faulty calls in a row")
+_FAULTY = re.compile(r"\d+ (faulty answers|times) in a row")
 _LOST = re.compile(r"no conversation found|no rollout found|session not found", re.IGNORECASE)
 _QUOTA = re.compile(
     r"usage[ _]limit|insufficient_quota|exceeded your current quota|credit balance|billing|(hit|reached) your [\w"
@@ -33,6 +36,11 @@ _QUOTA = re.compile(
     r"|weekly limit|quota exceeded|out of credits",
     re.IGNORECASE,
 )
+_EMPTY = re.compile(
+    r"insufficient[_ ](quota|balance)|exceeded your current quota|credit balance|billing|out of credits",
+    re.IGNORECASE,
+)
+"""Of an account without money, which no time brings."""
 _FINAL = re.compile(
     r"invalid (api|x-api) ?-?key|failed to authenticate|not logged in|please run /login|invalid bearer"
     r"|model_not_found|model [^\n]{0,80}(does not exist|not supported|not exist)|issue with the selected model"
@@ -52,6 +60,13 @@ _IN = re.compile(
 _PART = re.compile(r"(\d+(?:\.\d+)?)\s*([a-z]+)", re.IGNORECASE)
 _RESETS_IN = re.compile(r"resets_in_seconds\W{1,4}(\d+)")
 _EPOCH = re.compile(r"(?:\||resets_at\W{1,4})(\d{10})\b")
+_ISO = re.compile(r"\b20\d\d-\d\d-\d\d[T ]\d\d:\d\d(?::\d\d(?:\.\d{1,6})?)?(?: ?(?:Z|[+-]\d\d:?\d\d))?")
+_CLOCK = re.compile(
+    r"(?:resets?|again|until|available)[^\d\n]{0,20}\b(\d{1,2})(?::(\d\d))?(?::\d\d)? ?([ap]m)?\b"
+    r"(?: ?\(?([A-Z][\w/+-]*))?",
+    re.IGNORECASE,
+)
+"""A time of the day, with its zone; the machine's own without."""
 _UNITS = {"ms": 0.001, "s": 1.0, "m": 60.0, "h": 3600.0, "d": 86400.0}
 
 
@@ -79,7 +94,8 @@ def turn_failure_of(message: str, status: int | None = None, now: float | None =
         return TurnFailure(kind="final", message=text, provider=True)
     wait_s = _wait_in(message[:_MAX_SEARCHED], time.time() if now is None else now)
     if code == 402 or _QUOTA.search(text):
-        return TurnFailure(kind="quota", message=text, provider=True, wait_s=wait_s)
+        kind: Kind = "final" if wait_s is None and (code == 402 or _EMPTY.search(text)) else "quota"
+        return TurnFailure(kind=kind, message=text, provider=True, wait_s=wait_s)
     if code is not None and 400 <= code < 500 and code not in (408, 409, 425, 429):
         return TurnFailure(kind="final", message=text, provider=True)
     provider = code is not None or _PROVIDER.search(text) is not None
@@ -114,5 +130,22 @@ def _wait_in(text: str, now: float) -> float | None:
         wait_s = sum(float(part) * _UNITS.get(one, 0.0) for (part, _), one in zip(parts, units, strict=True))
         wait_s = wait_s or math.inf  # no known unit
     else:
-        return None
+        return _until_in(text, now)
     return wait_s if math.isfinite(wait_s) else None
+
+
+def _until_in(text: str, now: float) -> float | None:
+    """Seconds to the date or the time of the day in the text."""
+    try:
+        if (iso := _ISO.search(text)) is not None:
+            return max(0.0, datetime.fromisoformat(iso[0].replace(" Z", "Z")).timestamp() - now)
+        clock = _CLOCK.search(text)
+        if clock is None or not (clock[2] or clock[3]):
+            return None
+        half = 12 * (clock[3].lower() == "pm") if clock[3] else 0
+        hour = int(clock[1]) % 12 + half if clock[3] else int(clock[1])
+        here = datetime.fromtimestamp(now, ZoneInfo(clock[4]) if clock[4] else None)
+        at = here.replace(hour=hour, minute=int(clock[2] or 0), second=0, microsecond=0)
+        return (at - here).total_seconds() % 86400.0
+    except (ValueError, OverflowError, ZoneInfoNotFoundError):
+        return None

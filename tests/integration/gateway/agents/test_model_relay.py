@@ -130,7 +130,7 @@ def test_the_key_is_nowhere_in_the_jail(tmp_path: Path, operator: Path, api_name
         ([Step(odd=odd_answers.page)], "answered 200 with text/html", 1),
         ([Step(status=401, text="no such key")], "no such key", 1),
         ([Step(status=404, text="no such model")], "no such model", 1),
-        ([Step(unknown="edit_file")] * 20, "5 faulty calls in a row, the last: there is no tool", 10),
+        ([Step(unknown="edit_file")] * 20, "3 faulty answers in a row, the last: there is no tool", 6),
     ],
 )
 def test_a_model_that_cannot_play_ends_the_run_with_the_reason(
@@ -158,8 +158,8 @@ def test_a_spent_model_budget_ends_the_run_with_what_it_has(tmp_path: Path, oper
 
 
 def test_a_program_that_hangs_is_counted_and_resumed(tmp_path: Path, operator: Path) -> None:
-    script = [Step(odd=odd_answers.hang(14.0)), *ENDS]
-    record, api, _ = played(tmp_path, operator, script, silence_s=10.0)
+    script = [Step(odd=odd_answers.hang(35.0)), *ENDS]
+    record, api, _ = played(tmp_path, operator, script, silence_s=25.0)
     use, _ = used_in(record)
     assert (record.outcome.status, record.agent.retries) == ("completed", 1)
     assert (use.requests, use.requests_failed) == (api.n_asked, 1)

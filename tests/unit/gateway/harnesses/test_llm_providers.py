@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import io
 import json
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -19,6 +21,7 @@ from stages.provider_api import (
     chat_usage,
 )
 
+from evopolicy_gateway.agents.llm.agent import Events, Session, play_turn
 from evopolicy_gateway.agents.llm.conversation import ApiError, Conversation, Reply
 from evopolicy_gateway.harnesses.interface.agent_config import PROVIDERS, ApiName, ProviderName
 
@@ -37,6 +40,12 @@ SPENT = {
     "cache_creation_input_tokens": 0,
     "output_tokens": OUTPUT,
 }
+
+
+def known_settings(server: ProviderApi, api: str) -> dict[str, Any]:
+    settings: dict[str, Any] = {"api": api, "provider": "compatible", "model": "m-1", "system": ""}
+    settings |= {"base_url": server.base_url, "variable": "KEY", "effort": None, "parameters": {}}
+    return settings | {"retries": 0, "timeout_s": 9.0, "context_tokens": 10**6, "max_output_tokens": 9}
 
 
 async def conversed(
@@ -279,3 +288,130 @@ async def test_the_words_in_a_list_of_errors_are_told() -> None:
     with ProviderApi("chat", SCRIPT, refuses=lambda request: (400, error)) as server, known as raised:
         await conversed(server, "chat", 1)
     assert raised.value.status == 400
+
+
+ERRORS: list[tuple[ApiName, int, Any, str]] = [
+    (
+        "chat",
+        429,
+        {"error": {"message": "You exceeded your current quota.", "code": "insufficient_quota", "type": "x"}},
+        "^quota exceeded: You exceeded your current quota",
+    ),
+    ("chat", 402, {"error": {"message": "Insufficient Balance"}}, "^quota exceeded: Insufficient Balance"),
+    (
+        "messages",
+        401,
+        {"type": "error", "error": {"type": "authentication_error", "message": "invalid x-api-key"}},
+        "^the provider does not accept the key in THE_KEY: invalid x-api-key",
+    ),
+    (
+        "gemini",
+        400,
+        {
+            "error": {
+                "code": 400,
+                "message": "API key not valid.",
+                "status": "INVALID_ARGUMENT",
+                "details": [
+                    {"@type": "type.googleapis.com/google.rpc.ErrorInfo", "reason": "API_KEY_INVALID"}
+                ],
+            }
+        },
+        "^the provider does not accept the key in THE_KEY: API key not valid",
+    ),
+    (
+        "chat",
+        404,
+        {"error": {"message": "The model does not exist", "code": "model_not_found"}},
+        "^there is no model m-1 for this key: The model does not exist; the server lists m-2, other$",
+    ),
+    (
+        "responses",
+        400,
+        {"error": {"message": "Your input exceeds the context window", "code": "context_length_exceeded"}},
+        "longer than the model's context, set context_tokens below it: Your input exceeds",
+    ),
+    (
+        "chat",
+        400,
+        {"object": "error", "message": '"auto" tool choice requires --enable-auto-tool-choice', "code": 400},
+        "takes no tools, which the agent needs: .*--enable-auto-tool-choice",
+    ),
+    ("chat", 404, {"error": {"message": "No endpoints found that support tool use."}}, "takes no tools"),
+]
+
+
+@pytest.mark.parametrize(("api", "status", "body", "words"), ERRORS)
+async def test_errors_say_what_is_wrong_in_the_users_words(
+    api: ApiName, status: int, body: Any, words: str
+) -> None:
+    with (
+        ProviderApi(api, SCRIPT, refuses=lambda request: (status, body), models=["other", "m-2"]) as server,
+        pytest.raises(ApiError, match=words) as raised,
+    ):
+        await conversed(server, api, 1, variable="THE_KEY")
+    assert raised.value.too_long is ("context" in words)
+
+
+class Heard:
+    """Events of a turn."""
+
+    def __init__(self) -> None:
+        self.out = io.StringIO()
+        self.events = Events(self.out, "s")
+
+    @property
+    def lines(self) -> list[Document]:
+        return [json.loads(line) for line in self.out.getvalue().splitlines()]
+
+
+async def turn(
+    tmp_path: Path, script: list[Said], api: str = "chat"
+) -> tuple[int, list[Document], ProviderApi]:
+    heard = Heard()
+    with ProviderApi(api, script) as server:
+        conversation = Conversation(known_settings(server, api), "key")
+        status = await play_turn(conversation, "Go on.", Session(tmp_path / "s.json"), heard.events)
+    return status, heard.lines, server
+
+
+CUT = {"chat": "length", "responses": "max_output_tokens", "messages": "max_tokens", "gemini": "MAX_TOKENS"}
+
+
+@apis
+async def test_an_answer_that_is_cut_at_its_length_ends_no_turn(tmp_path: Path, api: ApiName) -> None:
+    cut = Said(text="I will", finish=CUT[api])
+    status, lines, _ = await turn(tmp_path, [cut, cut, Said(text="done")], api)
+    assert (status, lines[-1]["result"]) == (0, "done")
+    status, lines, server = await turn(tmp_path, [cut] * 4, api)
+    assert (status, len(server.requests)) == (1, 3)
+    assert "3 faulty answers in a row, the last: the answer was cut at its length" in lines[-1]["result"]
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        '<tool_call>\n{"name": "bash", "arguments": {"command": "ls"}}\n</tool_call>',
+        "I look. <|tool_calls_section_begin|>functions.bash:0",
+        '[TOOL_CALLS][{"name": "bash"}]',
+        "<function=bash><parameter=command>ls</parameter></function>",
+        '```json\n{"name": "bash", "arguments": {}}\n```',
+    ],
+)
+async def test_a_call_that_is_written_as_text_is_named_so(tmp_path: Path, text: str) -> None:
+    status, lines, server = await turn(tmp_path, [Said(text=text)] * 4)
+    assert (status, len(server.requests)) == (1, 3)
+    assert "the server's tool parser is off" in lines[-1]["result"]
+    assert "tool parser" in server.requests[1]["messages"][-1]["content"]
+
+
+async def test_a_model_that_repeats_a_command_is_told_and_then_ended(tmp_path: Path) -> None:
+    status, lines, server = await turn(tmp_path, [Said(commands=("echo same",))] * 12)
+    assert (status, len(server.requests)) == (1, 10)
+    outputs = [line["message"]["content"][0]["content"] for line in lines if line["type"] == "user"]
+    assert outputs[3] == "[exit status 0]\nsame\n"
+    assert outputs[4].endswith("[This was the 5th time in a row with this output. Do something else.]")
+    assert lines[-1]["result"] == "10 times in a row the same command with the same output: echo same"
+    other = [Said(commands=(f"echo {n % 2}",)) for n in range(12)]
+    status, _, server = await turn(tmp_path, [*other, Said(text="done")])
+    assert (status, len(server.requests)) == (0, 13)
