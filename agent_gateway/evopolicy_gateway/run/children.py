@@ -232,7 +232,7 @@ class SupervisedAgent(Kept):
         return ended
 
     def _start_order(self, ready: Ready, relay: RelayAddress | None) -> messages.StartAgent:
-        plan, folder, config = self._run.plan, self._run.folder, self._run.plan.agent_config
+        plan, folder, config = self._run.plan, self._run.folder, self._run.plan.known_config
         # A replayed agent sees the recorded run's paths.
         shown = folder if plan.replays is None else RunFolder(plan.replays.root)
         jail = None

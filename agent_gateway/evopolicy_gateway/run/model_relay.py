@@ -38,6 +38,7 @@ from evopolicy_gateway.processes.child_messages import (
     RelayAddress,
     StartRelay,
 )
+from evopolicy_gateway.relay import ledger
 from evopolicy_gateway.relay.service import Order
 from evopolicy_gateway.run import recorded_agent
 from evopolicy_gateway.run.children import Kept, OpenRun
@@ -88,6 +89,15 @@ class ModelRelay(Kept):
     async def end(self, grace_s: float) -> None:
         self._sock.close()
         await super().end(grace_s)
+        plan, used = self._run.plan, ledger.read(self._run.folder.model_requests)
+        config = plan.known_config
+        tokens = used.usage.recorded(None if config is None else config.prices)
+        cost = tokens.pop("cost", None)
+        kinds = ", ".join(f"{name.replace('_', ' ')} {count:,}" for name, count in tokens.items())
+        price = "no prices known" if cost is None else f"{cost:,.2f} dollars"
+        self._run.note(
+            f"model use: {used.requests:,} requests ({used.failed:,} failed), tokens: {kinds}; {price}"
+        )
 
 
 def of_run(run: OpenRun, ready: Ready, model_spent: asyncio.Event) -> ModelRelay | None:

@@ -22,7 +22,7 @@ from evopolicy_common.records.open_run import IntendedRun
 from evopolicy_common.records.run_files import read_record
 from evopolicy_common.records.run_record import AgentLimits
 from evopolicy_gateway import harnesses
-from evopolicy_gateway.harnesses.interface.agent_config import AgentConfig
+from evopolicy_gateway.harnesses.interface.agent_config import USUAL_COST, AgentConfig
 from evopolicy_gateway.harnesses.interface.base import Harness
 from evopolicy_gateway.jail.settings import JailSettings
 from evopolicy_gateway.processes.clock import SILENCE_S
@@ -105,18 +105,18 @@ class Plan(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def known_config(self) -> AgentConfig | None:
-        """A coding agent's settings with the operator's prices."""
+        """A coding agent's settings with the operator's prices, and with the usual limit of the cost: with prices, and
+        not in a published profile."""
         config = self.config or harnesses.config_of(self.agent, self.started_in)
-        return config and msgspec.structs.replace(config, prices=self.prices or config.prices)
-
-    @property
-    def agent_config(self) -> AgentConfig | None:
-        """As `known_config`; None where the agent's own text says all."""
-        return self.config if self.prices is None else self.known_config
+        if config is None:
+            return None
+        prices = self.prices or config.prices
+        usual = USUAL_COST if prices is not None and self.settings.profile == "own" else None
+        return msgspec.structs.replace(config, prices=prices, max_cost=config.max_cost or usual)
 
     def harness(self) -> Harness:
         """The agent's harness. Raises ConfigError for an invalid agent."""
-        return harnesses.make(self.agent, self.started_in, self.agent_config)
+        return harnesses.make(self.agent, self.started_in, self.known_config)
 
     @property
     def provider(self) -> str:

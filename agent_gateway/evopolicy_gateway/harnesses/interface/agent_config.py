@@ -28,6 +28,8 @@ from evopolicy_gateway.workspace.prompts import Prompts
 
 ProviderName = Literal["openai", "anthropic", "google", "deepseek", "moonshot", "mistral", "openrouter"]
 ApiName = Literal["responses", "chat", "messages", "gemini"]
+USUAL_COST = 20.0
+"""Limit of a run's cost with prices, US dollars."""
 
 
 class TokenPaths(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -244,7 +246,8 @@ class AgentConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     max_tokens: Annotated[int, Meta(ge=1)] | None = None
     """Limit per run, all kinds of tokens together."""
     max_cost: Annotated[float, Meta(gt=0)] | None = None
-    """Limit per run, US dollars; needs `prices`, here or from `--set prices=FILE.toml`."""
+    """Limit per run, US dollars; needs `prices`, here or from `--set prices=FILE.toml`. None: 20 where there are
+    prices, and no limit with a published profile."""
     prices: Prices | None = None
     prompts: Prompts | None = None
     """Texts in place of the standard prompts; those of the run's own options win."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import re
 import signal
 from collections.abc import Iterator
 from pathlib import Path
@@ -28,6 +29,7 @@ ENDS = [SUBMIT, SUBMIT, SUBMIT, Step(text="done")]
 """Spends the budget of six episodes."""
 SEARCH = """
 import os
+import re
 needle, found = b"-".join((b"key", b"of", b"the", b"test", b"0123456789")), []
 def look(path):
     try:
@@ -176,6 +178,11 @@ def test_a_cancelled_run_has_all_that_it_used(tmp_path: Path, operator: Path) ->
         running.wait()
         record = record_in(run_dir(tmp_path))
     use, tokens = used_in(record)
+    told = re.search(
+        r"model use: (\d+) requests .* tokens: input noncached ([\d,]+), .*; no prices known", running.text
+    )
+    assert told is not None, running.text
+    assert (int(told[1]), int(told[2].replace(",", ""))) == (use.requests, tokens.input_noncached)
     assert record.outcome.status == "cancelled"
     assert (record.agent.harness, record.agent.model_string, record.agent.turns) == ("llm", "m-1", 1)
     assert record.agent.cli_version is not None

@@ -112,3 +112,20 @@ def test_max_cost_needs_prices_which_an_option_gives(tmp_path: Path) -> None:
         without.harness()
     # Prices do not define a run: a sweep whose prices change goes on.
     assert plan.digest == without.digest
+
+
+def test_prices_limit_the_cost_but_in_a_published_profile(tmp_path: Path) -> None:
+    (tmp_path / "prices.toml").write_text(FILE)
+    (tmp_path / "agent.toml").write_text('harness = "codex"\nmodel = "m-1"\n')
+    agent, prices = f"file:{tmp_path / 'agent.toml'}", str(tmp_path / "prices.toml")
+    with_prices = _cluster.plan_of("toy/line", agent, prices=prices, exp_id="e")
+    published = msgspec.structs.replace(with_prices.settings, profile="published")
+    plans = [
+        (with_prices, 20.0),
+        (_cluster.plan_of("toy/line", agent, exp_id="e"), None),
+        (msgspec.structs.replace(with_prices, settings=published), None),
+    ]
+    for plan, expected in plans:
+        terms = plan.harness().model
+        assert terms is not None
+        assert terms.limits.max_cost == expected
