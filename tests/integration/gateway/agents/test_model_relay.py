@@ -168,7 +168,7 @@ def test_a_program_that_hangs_is_counted_and_resumed(tmp_path: Path, operator: P
 
 
 def test_a_cancelled_run_has_all_that_it_used(tmp_path: Path, operator: Path) -> None:
-    script = [SUBMIT, Step(text="one"), *[Step(command="sleep 0.2")] * 99]
+    script = [SUBMIT, Step(text="one"), *(Step(command=f"sleep 0.2{n}") for n in range(99))]
     with (
         ModelApi(script) as api,
         command(tmp_path, *run_arguments(operator, llm_agent(tmp_path, api.base_url))) as running,
@@ -195,7 +195,7 @@ def test_a_cancelled_run_has_all_that_it_used(tmp_path: Path, operator: Path) ->
 def test_a_kill_loses_no_finished_request(tmp_path: Path, operator: Path, victim: str) -> None:
     """Attack: kills or ends processes so that requests are not counted. Defence: the ledger is written
     before an answer ends."""
-    script = [SUBMIT, *[Step(command="sleep 0.1")] * 12, *ENDS[1:]]
+    script = [SUBMIT, *(Step(command=f"sleep 0.1{n}") for n in range(12)), *ENDS[1:]]
     with ModelApi(script) as api:
         arguments = run_arguments(operator, llm_agent(tmp_path, api.base_url))
         with command(tmp_path, *arguments) as running:
