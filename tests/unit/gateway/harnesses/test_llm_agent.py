@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import socket
 from importlib import metadata
 from pathlib import Path
@@ -145,9 +146,14 @@ def test_a_conversation_beyond_the_models_context_goes_on_without_old_outputs(
         "prompt is too long: 200001 tokens > 200000 maximum",
     ],
 )
-def test_providers_words_for_a_conversation_that_is_too_long_are_known(text: str) -> None:
-    assert ApiError(text, 400, None).too_long
-    assert not ApiError(text, 500, None).too_long
+async def test_providers_words_for_a_conversation_that_is_too_long_are_known(text: str) -> None:
+    for status in (400, 500):
+        with ModelApi([Step(status=status, text=text)] * 2) as server:
+            known = Conversation({"api": "messages", "base_url": server.base_url, **KNOWN}, "")
+            known.say("hello")
+            with pytest.raises(ApiError, match=re.escape(text)) as raised:
+                await known.ask()
+        assert raised.value.too_long is (status == 400)
 
 
 def test_shortening_goes_on_until_two_outputs_are_left() -> None:
