@@ -94,7 +94,7 @@ test-system test-families test-long: HOST = --all-tests
 test test-root test-system test-families test-long: export PYTHONDONTWRITEBYTECODE :=
 test test-root test-system test-families test-long: install
 	@bash deploy/setup-host.sh $(HOST)
-	@short="$$(mktemp -d /tmp/evp-XXXXXX)"; TMPDIR="$$short" $(BIN)/python -m pytest --processes $(PROCESSES) --basetemp="$$short/t" \
+	@short="$$(mktemp -d /tmp/evp-XXXXXX)"; chmod 711 "$$short"; TMPDIR="$$short" $(BIN)/python -m pytest --processes $(PROCESSES) --basetemp="$$short/t" \
 	$(if $(findstring tests/,$(ARGS)),,-m "$(LAYERS)") $(ARGS); status=$$?; \
 	if [ $$status = 0 ]; then rm -rf "$$short"; else echo "the failed tests' files are in $$short"; fi; exit $$status
 
