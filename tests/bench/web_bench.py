@@ -69,10 +69,10 @@ def decoded(data: bytes) -> StatusReply:
 def page(site: object, name: str, template: str) -> tuple[str, float]:
     """A first page, and how long it took to make."""
     began = time.perf_counter()
-    view = site.view_of(name, Words(), may_act=False)()  # type: ignore[attr-defined]
+    view = site.view_of(name, Words())()  # type: ignore[attr-defined]
     html = rendering.page(
         template, view=view, live=f"/events/{name}", cursor="x.1", words=Words(), title=name, here=name,
-        has_cluster=True, has_report=False, acting=False,
+        has_cluster=True, has_report=False,
     )  # fmt: skip
     return html, time.perf_counter() - began
 

@@ -145,10 +145,6 @@ LOCAL = ["evopolicy", "local", "--env", "toy", "--agent"]
         ),
         (["evopolicy", "disk", "--state", "EMPTY"], "it has no coordinator.sqlite; name one with --state"),
         (["evopolicy", "web", "--tls-certificate", "FILE", "--tls-key", "FILE"], "both in PEM"),
-        (
-            ["evopolicy", "web", "--act", "--action-log", "FILE/log"],
-            "choose another folder with --action-log",
-        ),
         (["evopolicy-coordinator", "--state", "new", "--listen", "tcp/127.0.0.1:IN USE"], "with --listen"),
         (["evopolicy-coordinator", "certs", "revoke", "x", "--state", "EMPTY"], "certs init --state EMPTY"),
         (["evopolicy-worker", "check-env", "toy/line", "--results", "FILE/x"], "folder with --results"),

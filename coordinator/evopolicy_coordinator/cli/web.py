@@ -16,7 +16,6 @@ import typer
 from evopolicy_common.cli.conventions import Connect, CredentialsFile, end_on_sigterm, setup_logging
 from evopolicy_common.cli.frame import App
 from evopolicy_common.errors import ConfigError, EvopolicyError
-from evopolicy_common.processes.preflight import check_writable
 from evopolicy_common.records.blobs import announcing
 from evopolicy_common.regular_files import read_given
 from evopolicy_common.terminal import say
@@ -57,22 +56,8 @@ def web(
     token_file: Annotated[
         Path | None,
         typer.Option(
-            help="File that keeps the tokens, mode 0600, so that browsers stay signed in after a restart;"
-            " default: new tokens.",
-            show_default=False,
-        ),
-    ] = None,
-    act: Annotated[
-        bool,
-        typer.Option(
-            "--act",
-            help="Print a second address that also allows to pause, cancel and repin; every action is logged.",
-        ),
-    ] = False,
-    action_log: Annotated[
-        Path | None,
-        typer.Option(
-            help="Log of these actions; default: web-actions.jsonl in the user's state home.",
+            help="File that keeps the token, mode 0600, so that browsers stay signed in after a restart;"
+            " default: a new token.",
             show_default=False,
         ),
     ] = None,
@@ -91,7 +76,7 @@ def web(
     """
     setup_logging("warning")
     # Here, not above: it needs starlette and jinja2, and `evopolicy` loads this module to list its commands.
-    from evopolicy_coordinator.web.access import Access, Tokens, kept_tokens
+    from evopolicy_coordinator.web.access import Access, drawn_token, kept_token
     from evopolicy_coordinator.web.app import Site, listen, serve
 
     host, port = credentials.host_and_port(
@@ -108,11 +93,8 @@ def web(
         if not folder.is_dir():
             raise ConfigError(f"{folder} is not a folder; name a folder of runs, such as runs")
     roots = runs or [folder for folder in (Path("runs"),) if folder.is_dir()]
-    tokens = Tokens.drawn() if token_file is None else kept_tokens(token_file)
+    token = drawn_token() if token_file is None else kept_token(token_file)
     known = _credentials(tuple(connect or ()), file)
-    book = (action_log or credentials.state_home() / "web-actions.jsonl") if act else None
-    if book is not None:
-        check_writable(book.parent, "--action-log")
     with announcing(url_file) as announce, listen(host, port) as sock:
         if known is not None and not (connect or file) and not asyncio.run(_is_reachable(known)):
             say("this machine's coordinator does not answer: the folders alone are shown", err=True)
@@ -123,18 +105,15 @@ def web(
         base = f"{scheme}://{f'[{shown}]' if ':' in shown else shown}:{port}/login#token="
         site = Site(
             roots,
-            Access(tokens, acting=act, names=[host, *(name or ())], cookie=f"evopolicy_{port}"),
+            Access(token, names=[host, *(name or ())], cookie=f"evopolicy_{port}"),
             credentials=known,
             report=report,
-            action_log=book,
             title=", ".join(each.resolve().name or "/" for each in roots or [Path.cwd()]),
         )
 
         def ready() -> None:
-            announce((base + tokens.read).encode())
-            say(f"view: {base}{tokens.read}")
-            if act:
-                say(f"view and act: {base}{tokens.act}")
+            announce((base + token).encode())
+            say(f"view: {base}{token}")
             if scheme == "http" and not credentials.stays_on_machine(f"tcp/{host}:{port}"):
                 say(
                     "note: without --tls-certificate the token and the pages cross the network unencrypted",

@@ -4,7 +4,7 @@ Rules that this module owns:
 - A token is needed on loopback too, since an agent without a jail reaches loopback. It travels in the body of a
   sign-in, in a cookie or in an `Authorization` header, never in a path or a query, which logs and histories keep. The
   printed URL has it in its fragment, which browsers send to nobody.
-- The reading token and the acting token are different. Without `--act` there is no acting token at all.
+- The pages read and change nothing, so that one token suffices.
 - `Host` must be an address or a name of this server, else a page elsewhere could be made to resolve to it (DNS
   rebinding).
 - A request that another site's page caused is refused, whatever cookies come with it.
@@ -18,21 +18,17 @@ import ipaddress
 import re
 import secrets
 import socket
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from http.cookies import CookieError, SimpleCookie
 from pathlib import Path
-from typing import Literal
 
-import msgspec
 from starlette.datastructures import Headers, MutableHeaders
 from starlette.responses import PlainTextResponse, RedirectResponse, Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from evopolicy_common.errors import DECODE_ERRORS, ConfigError
+from evopolicy_common.errors import ConfigError
 from evopolicy_common.records.blobs import write_atomically
 from evopolicy_common.regular_files import read_given
-
-Role = Literal["read", "act"]
 
 POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; media-src 'self'; connect-src"
@@ -54,73 +50,59 @@ _HOST = re.compile(r"(?:\[(?P<six>[0-9A-Fa-f:.]+)\]|(?P<name>[A-Za-z0-9._-]+))(?
 """The `Host` header; a browser sends names of other alphabets in ASCII."""
 
 
-class Tokens(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """The secrets of one view."""
-
-    read: str
-    act: str
-
-    @classmethod
-    def drawn(cls) -> Tokens:
-        """New ones."""
-        return cls(read=secrets.token_urlsafe(32), act=secrets.token_urlsafe(32))
+def drawn_token() -> str:
+    """A new token."""
+    return secrets.token_urlsafe(32)
 
 
-def kept_tokens(path: Path) -> Tokens:
-    """The tokens in a file of mode 0600, which is made where it is not there. ConfigError for a file that is no such
+def kept_token(path: Path) -> str:
+    """The token in a file of mode 0600, which is made where it is not there. ConfigError for a file that is no such
     file."""
     try:
         if path.stat().st_mode & 0o077:
             raise ConfigError(f"--token-file {path} may be read by others: chmod 600 it")
-        tokens = msgspec.json.decode(read_given(path, f"--token-file {path}"), type=Tokens)
+        token = read_given(path, f"--token-file {path}").decode("ascii").strip()
     except FileNotFoundError:
-        tokens = Tokens.drawn()
-        write_atomically(path, msgspec.json.encode(tokens), mode=0o600)
+        token = drawn_token()
+        write_atomically(path, token.encode(), mode=0o600)
     except OSError as error:
         raise ConfigError(f"--token-file {path} cannot be read: {error.strerror or error}") from error
-    except DECODE_ERRORS as error:
-        raise ConfigError(f"--token-file {path}: {error}; remove it, and it is created again") from error
-    if min(len(tokens.read), len(tokens.act)) < 32 or tokens.read == tokens.act:
-        raise ConfigError(f"--token-file {path}: two different tokens of 32 characters or more are needed")
-    return tokens
+    except UnicodeDecodeError:
+        raise ConfigError(f"--token-file {path} holds no token; remove it, and it is created again") from None
+    if len(token) < 32:
+        raise ConfigError(
+            f"--token-file {path}: a token of 32 characters or more is needed; remove it, and it is created again"
+        )
+    return token
 
 
 class Access:
     """Decides about requests."""
 
-    def __init__(self, tokens: Tokens, *, acting: bool, names: Iterable[str] = (), cookie: str) -> None:
+    def __init__(self, token: str, *, names: Iterable[str] = (), cookie: str) -> None:
         """`names`: host names, beside addresses and localhost, under which browsers find this server."""
         self.cookie = cookie
         own = {socket.gethostname().lower(), *(name.lower() for name in names), "localhost"}
         self._names = frozenset(name.rstrip(".") for name in own if name)
-        self._tokens: dict[Role, str] = {"read": tokens.read}
-        if acting:
-            self._tokens["act"] = tokens.act
+        self._token = token
+        # Derived from the token, so that it outlives a restart if the token does.
+        self.cookie_value = hmac.new(token.encode(), b"evopolicy web cookie", hashlib.sha256).hexdigest()
 
-    def role_of_token(self, token: str) -> Role | None:
-        """A token's rights; None for a wrong token."""
-        return self._matching(token, self._tokens)
+    def admits_token(self, token: str) -> bool:
+        """Whether it is the token."""
+        return hmac.compare_digest(token.encode(), self._token.encode())
 
-    def cookie_of(self, role: Role) -> str:
-        """The cookie's value. It is derived from the token, so it outlives a restart if the token does."""
-        return hmac.new(self._tokens[role].encode(), b"evopolicy web cookie", hashlib.sha256).hexdigest()
-
-    def role_of(self, headers: Headers) -> Role | None:
-        """A request's rights, by its cookie or its `Authorization`."""
+    def admits(self, headers: Headers) -> bool:
+        """Whether a request may read, by its cookie or its `Authorization`."""
         scheme, _, token = headers.get("authorization", "").partition(" ")
         if scheme.lower() == "bearer":
-            return self.role_of_token(token.strip())
+            return self.admits_token(token.strip())
         try:
             morsel = SimpleCookie(headers.get("cookie", "")).get(self.cookie)
         except CookieError:
-            return None
-        cookies = {role: self.cookie_of(role) for role in self._tokens}
-        return self._matching("" if morsel is None else morsel.value, cookies)
-
-    def _matching(self, given: str, right: Mapping[Role, str]) -> Role | None:
-        # All are compared, so that the time tells nothing.
-        roles = [role for role, each in right.items() if hmac.compare_digest(given.encode(), each.encode())]
-        return roles[-1] if roles else None
+            return False
+        given = "" if morsel is None else morsel.value
+        return hmac.compare_digest(given.encode(), self.cookie_value.encode())
 
     def is_own_host(self, host: str) -> bool:
         """Whether `Host` names this server: an address, which cannot be rebound, or one of its names."""
@@ -150,8 +132,7 @@ class Access:
 
 
 class Guard:
-    """ASGI middleware: checks every request, and gives every answer its security headers. `scope["role"]` tells the
-    rest."""
+    """ASGI middleware: checks every request, and gives every answer its security headers."""
 
     def __init__(self, app: ASGIApp, access: Access) -> None:
         self._app = app
@@ -177,8 +158,7 @@ class Guard:
         headers, path = Headers(scope=scope), str(scope["path"])
         if (objection := self._access.objection(scope["scheme"], scope["method"], headers)) is not None:
             return PlainTextResponse(objection[1] + "\n", objection[0])
-        role = scope["role"] = self._access.role_of(headers)
-        if role is not None or path in _OPEN or path.startswith("/static/"):
+        if self._access.admits(headers) or path in _OPEN or path.startswith("/static/"):
             return None
         if scope["method"] == "GET" and "text/html" in headers.get("accept", ""):
             return RedirectResponse("/login", 303)

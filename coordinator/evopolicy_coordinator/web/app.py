@@ -12,7 +12,6 @@ import resource
 import socket
 import time
 from collections.abc import AsyncIterator, Callable, Mapping
-from functools import partial
 from pathlib import Path
 from typing import Any
 from urllib.parse import parse_qsl
@@ -25,19 +24,18 @@ from starlette.responses import HTMLResponse, PlainTextResponse, RedirectRespons
 from starlette.routing import Route
 from starlette.types import ASGIApp
 
-from evopolicy_common.errors import ConfigError, EvopolicyError
+from evopolicy_common.errors import ConfigError
 from evopolicy_common.logs import structlog
 from evopolicy_common.messages.status import StatusReply
 from evopolicy_common.wire.credentials import Credentials
 from evopolicy_common.wire.http import bound, serving
 from evopolicy_coordinator.server.monitoring.metrics import CONTENT_TYPE, StatusCollector
-from evopolicy_coordinator.web import acting
 from evopolicy_coordinator.web.access import Access, Guard
 from evopolicy_coordinator.web.content import rendering
 from evopolicy_coordinator.web.content.cluster import Cluster, set_within
 from evopolicy_coordinator.web.content.confined import Confined, NotThereError
 from evopolicy_coordinator.web.content.feeds import Feeds
-from evopolicy_coordinator.web.content.rendering import Words, ident
+from evopolicy_coordinator.web.content.rendering import Words
 from evopolicy_coordinator.web.content.run_detail import IMAGES, Detail
 from evopolicy_coordinator.web.content.run_folders import Reader, RunFacts, Runs
 from evopolicy_coordinator.web.views.cluster import cluster_view
@@ -83,16 +81,14 @@ class Site:
         title: str = "evopolicy",
         credentials: Credentials | None = None,
         report: Path | None = None,
-        action_log: Path | None = None,
     ) -> None:
-        """`credentials` None: no cluster, only folders. `action_log` None: no actions."""
+        """`credentials` None: no cluster, only folders."""
         self.title = title
         self.access = access
         self.feeds = Feeds()
         self.reader = Reader(roots)
         self.runs = Runs(shut=None if credentials is not None else frozenset())
         self.report = None if report is None else Confined(report)
-        self.book = None if action_log is None else acting.Log(action_log)
         self.cluster: Cluster | None = None
         self._moved = asyncio.Event()
         self._scanned_at = float("-inf")
@@ -153,13 +149,13 @@ class Site:
 
     # ---- views by page ----
 
-    def view_of(self, page: str, words: Words, *, may_act: bool) -> Callable[[], rendering.View]:
+    def view_of(self, page: str, words: Words) -> Callable[[], rendering.View]:
         """The function that makes the parts of a page. NotThereError for an unknown page."""
         cluster = self.cluster
         if page == "runs":
-            return lambda: sweeps_view(self.runs, cluster, words, self.reader.roots, acting=may_act)
+            return lambda: sweeps_view(self.runs, cluster, words, self.reader.roots)
         if page == "cluster" and cluster is not None:
-            return lambda: cluster_view(cluster, words, self.runs, self.reader.roots, acting=may_act)
+            return lambda: cluster_view(cluster, words, self.runs, self.reader.roots)
         kind, _, key = page.partition("/")
         if kind != "run" or key not in self.runs.by_key:
             raise NotThereError(page)
@@ -167,15 +163,11 @@ class Site:
         def view() -> rendering.View:
             run = self.runs.by_key[key]
             retries = () if cluster is None else tuple(cluster.retries.get(run.run, ()))
-            about: dict[str, Any] = {"acting": may_act, "status": self.status, "retries": retries}
-            return run_view(run, self.runs, self.reader, words, **about)
+            return run_view(run, self.runs, self.reader, words, retries=retries)
 
         return view
 
     # ---- answers ----
-
-    def _may_act(self, request: Request) -> bool:
-        return request.scope.get("role") == "act" and self.book is not None
 
     def _page(
         self, request: Request, template: str, status: int = 200, *, here: str = "", **values: Any
@@ -185,7 +177,6 @@ class Site:
             here=here,
             has_cluster=self.cluster is not None,
             has_report=self.report is not None,
-            acting=self._may_act(request),
             **values,
         )
         return HTMLResponse(html, status)
@@ -200,10 +191,10 @@ class Site:
         self, request: Request, name: str, template: str, title: str, **more: Any
     ) -> Response:
         """A page whose parts are kept up to date."""
-        words, may_act = _words(request), self._may_act(request)
-        make = self.view_of(name, words, may_act=may_act)
+        words = _words(request)
+        make = self.view_of(name, words)
         view = await asyncio.to_thread(make)
-        feed = self.feeds.of(f"{may_act} {name} {words}", make, view)
+        feed = self.feeds.of(f"{name} {words}", make, view)
         live = f"/events/{name}{words.link()}".removesuffix("?")
         shown: dict[str, Any] = {"view": view, "live": live, "cursor": feed.cursor, "words": words}
         return self._page(request, template, here=name, title=title, **shown, **more)
@@ -228,10 +219,10 @@ class Site:
 
     async def events(self, request: Request) -> Response:
         """The updates of one page, as server-sent events."""
-        name, words, may_act = request.path_params["page"], _words(request), self._may_act(request)
-        make = self.view_of(name, words, may_act=may_act)
+        name, words = request.path_params["page"], _words(request)
+        make = self.view_of(name, words)
         cursor = request.headers.get("last-event-id") or request.query_params.get("since", "")
-        feed = self.feeds.of(f"{may_act} {name} {words}", make)
+        feed = self.feeds.of(f"{name} {words}", make)
         if feed.version == 0 or not feed.watchers:
             feed.update(await asyncio.to_thread(make))
         headers = {"x-accel-buffering": "no"}
@@ -280,11 +271,10 @@ class Site:
     async def login(self, request: Request) -> Response:
         if request.method == "GET":
             return self._page(request, "login.html.j2", title="Sign in", wrong=False)
-        role = self.access.role_of_token((await _form(request)).get("token", ""))
-        if role is None:
+        if not self.access.admits_token((await _form(request)).get("token", "")):
             return self._page(request, "login.html.j2", 401, title="Sign in", wrong=True)
         answer = RedirectResponse("/", 303)
-        cookie, secure = self.access.cookie_of(role), request.url.scheme == "https"
+        cookie, secure = self.access.cookie_value, request.url.scheme == "https"
         answer.set_cookie(self.access.cookie, cookie, httponly=True, samesite="strict", secure=secure)
         return answer
 
@@ -305,48 +295,6 @@ class Site:
             self.cluster.wake()
         return Response(await asyncio.to_thread(generate_latest, self._registry), media_type=CONTENT_TYPE)
 
-    # ---- acting ----
-
-    def _book_of_actor(self, request: Request) -> acting.Log:
-        if self.book is None or not self._may_act(request):
-            text = "This needs the acting token of a view that was started with --act."
-            raise PageError(403, "Not allowed", text)
-        return self.book
-
-    async def act(self, request: Request) -> Response:
-        """GET describes the action and shows a button. POST carries it out."""
-        kind, name, verb = (request.path_params[each] for each in ("kind", "name", "verb"))
-        book, act = self._book_of_actor(request), acting.ACTS.get((kind, verb))
-        if act is None:
-            raise NotThereError(verb)
-        back = "/cluster" if kind == "worker" else "/"
-        sweep = next((each for each in self.runs.sweeps if ident("sweep", str(each.root)) == name), None)
-        label = sweep.name if kind == "sweep" and sweep is not None else name
-        if request.method == "GET":
-            shown = {"title": f"{act.title}: {label}", "label": label, "back": back, "verb": verb}
-            of_class = request.query_params.get("class", "")[:200]
-            return self._page(request, "act.html.j2", act=act, fingerprint_class=of_class, **shown)
-        body = await _form(request)
-        form = {each: body.get(each, "")[:500] for each in ("class", "reason") if body.get(each)}
-        if act.needs and not (form.get("reason") and form.get("class")):
-            text = "A class and a reason are needed; the run's record names both."
-            raise PageError(400, "Not done", text)
-        operator = None if self.cluster is None else self.cluster.operator
-        who = "browser" if request.client is None else f"browser at {request.client.host}"
-        try:
-            work = partial(acting.carry_out, operator, kind, name, verb, sweep, form)
-            await acting.logged(book, work, act=f"{kind} {verb}", name=label, by=who, **form)
-        except (EvopolicyError, OSError) as error:
-            raise PageError(409, "Not done", str(error)) from error
-        self._scanned_at = float("-inf")
-        if self.cluster is not None:
-            self.cluster.acted()
-        return RedirectResponse(back, 303)
-
-    async def action_log(self, request: Request) -> Response:
-        entries = await asyncio.to_thread(self._book_of_actor(request).last)
-        return self._page(request, "log.html.j2", here="log", title="Actions", entries=entries)
-
     async def _refused(self, request: Request, error: Exception) -> Response:
         status, title, text = error.args if isinstance(error, PageError) else _NOT_THERE
         return self._page(request, "message.html.j2", status, title=title, text=text, back="/")
@@ -366,8 +314,6 @@ class Site:
             Route("/static/{name}", self.static),
             Route("/healthz", self.health),
             Route("/metrics", self.metrics),
-            Route("/act/{kind}/{name}/{verb}", self.act, methods=["GET", "POST"]),
-            Route("/log", self.action_log),
         ]
         refused = {PageError: self._refused, NotThereError: self._refused}
         site = Starlette(routes=routes, exception_handlers={Exception: _failed, **refused})

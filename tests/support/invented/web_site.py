@@ -13,27 +13,26 @@ from evopolicy_common.messages.run_settings import RunSettings
 from evopolicy_common.messages.status import RunStatus, StatusReply, WorkerStatus
 from evopolicy_common.records.policies.bundles import BundleFile, pack
 from evopolicy_common.wire.credentials import Credentials
-from evopolicy_coordinator.web.access import Access, Tokens
+from evopolicy_coordinator.web.access import Access
 from evopolicy_coordinator.web.app import Site
 from invented.policies import Version
 from invented.run_dirs import write_run
 
 HOST = "127.0.0.1:8765"
 ORIGIN = f"http://{HOST}"
-TOKENS = Tokens(read="r" * 43, act="a" * 43)
+TOKEN = "r" * 43
 NOBODY = Credentials(
     cluster="c", role="operator", endpoints=("tcp/127.0.0.1:1",), user="u", password="p", token="t"
 )
 """A cluster that is never connected to: its status is told to `Site.cluster.take`."""
 
 
-def site_of(*roots: Path, acting: bool = False, cluster: StatusReply | None = None, **more: Any) -> Site:
+def site_of(*roots: Path, cluster: StatusReply | None = None, **more: Any) -> Site:
     """A view of these folders; `cluster` is what its coordinator has just answered."""
     site = Site(
         list(roots),
-        Access(TOKENS, acting=acting, cookie="evopolicy_8765"),
+        Access(TOKEN, cookie="evopolicy_8765"),
         credentials=None if cluster is None else NOBODY,
-        action_log=roots[0] / "actions.jsonl" if acting else None,
         **more,
     )
     if cluster is not None:
@@ -41,11 +40,11 @@ def site_of(*roots: Path, acting: bool = False, cluster: StatusReply | None = No
     return site
 
 
-def client(site: Site, role: str | None = "read") -> TestClient:
-    """A browser that has signed in with the token of `role`; None: with none."""
+def client(site: Site, *, signed_in: bool = True) -> TestClient:
+    """A browser, which has signed in."""
     made = TestClient(site.app(), base_url=ORIGIN, follow_redirects=False)
-    if role is not None:
-        answer = made.post("/login", content=f"token={getattr(TOKENS, role)}", headers={"origin": ORIGIN})
+    if signed_in:
+        answer = made.post("/login", content=f"token={TOKEN}", headers={"origin": ORIGIN})
         assert answer.status_code == 303, answer.text
     return made
 
@@ -115,7 +114,7 @@ def open_run(
     }
     (episode / "trajectory.jsonl").write_text(json.dumps(row) + "\n" + json.dumps({**row, "t": 1}) + "\n")
     summary = {
-        "schema_version": 1, "submit_index": 0, "env": env, "status": "ok", "n_episodes": 1, "first_global_episode": 0,
+        "schema_version": "0.1", "submit_index": 0, "env": env, "status": "ok", "n_episodes": 1, "first_global_episode": 0,
         "env_instances": [7], "remaining_budget": 127, "submit_started_at": "2026-01-01T00:00:00.000000Z",
         "submit_completed_at": "2026-01-01T00:00:01.000000Z", "wall_time_seconds": 1.0, "returns": [-2.0],
         "mean_return": -2.0, "std_return": 0.0, "min_return": -2.0, "max_return": -2.0, "episode_lengths": [2],

@@ -61,7 +61,6 @@ class Cluster:
         self.retries: OrderedDict[str, dict[RetriedJobs, None]] = OrderedDict()
         """Repeated jobs of each run, oldest first; the coordinator reports only each run's last ones."""
         self._pause_s = 0.0
-        self._acted = asyncio.Event()
         self._at = float("-inf")
         self._credentials = credentials
         self._watched = watched
@@ -75,11 +74,6 @@ class Cluster:
 
     def wake(self) -> None:
         """A page is open: the next request does not wait for the idle pause."""
-        self._wake.set()
-
-    def acted(self) -> None:
-        """An action was carried out: a new status is requested at once."""
-        self._acted.set()
         self._wake.set()
 
     async def run(self) -> None:
@@ -98,10 +92,8 @@ class Cluster:
     async def _ask_on(self, operator: OperatorClient) -> None:
         while True:
             began = time.monotonic()
-            max_age_s = 0.0 if self._acted.is_set() else self._pause_s
-            self._acted.clear()
             try:
-                status = await operator.status(max_age_s)
+                status = await operator.status(self._pause_s)
             except EvopolicyError as error:
                 # The link connects again by itself, after a pause.
                 self._failed(str(error))
@@ -110,8 +102,8 @@ class Cluster:
             cost_s = status.cost_s or time.monotonic() - began
             self.take(status)
             self._pause_s = min(_IDLE_S, max(_LEAST_PAUSE_S, _SHARE * cost_s))
-            await set_within(self._acted, self._pause_s)
-            if not self._watched() and not self._acted.is_set():
+            await asyncio.sleep(self._pause_s)
+            if not self._watched():
                 self._wake.clear()
                 await set_within(self._wake, _IDLE_S - self._pause_s)
 

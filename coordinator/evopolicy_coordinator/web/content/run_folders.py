@@ -124,7 +124,6 @@ class Sweep(msgspec.Struct, frozen=True, kw_only=True):
     name: str
     root: Path | None
     runs: tuple[RunFacts, ...]
-    is_suite: bool
     paused: bool = False
 
 
@@ -188,12 +187,12 @@ class Reader:
                     name = (entry.agent, entry.env, f"{suite}-{entry.repeat}")
                     status = by_run.get(entry.run) or by_name.get(name)
                     runs.append(_elsewhere(f"{root}\n{entry.name}", entry, status))
-            paused, is_suite = (root / PAUSED).exists(), index is not None
-            sweeps.append(Sweep(name=suite, root=root, runs=tuple(runs), is_suite=is_suite, paused=paused))
+            paused = (root / PAUSED).exists()
+            sweeps.append(Sweep(name=suite, root=root, runs=tuple(runs), paused=paused))
         seen = {run.run for sweep in sweeps for run in sweep.runs}
         others = [each for each in by_run.values() if each.run not in seen]
         if elsewhere := tuple(_elsewhere(each.run, None, each) for each in others):
-            sweeps.append(Sweep(name="elsewhere on the cluster", root=None, runs=elsewhere, is_suite=False))
+            sweeps.append(Sweep(name="elsewhere on the cluster", root=None, runs=elsewhere))
         by_key = {run.key: run for sweep in sweeps for run in sweep.runs}
         open_here = [run for run in by_key.values() if run.path and run.agent_alive and not run.finished]
         on_cluster = [status for status in by_run.values() if _may_be_alive(status)]

@@ -30,7 +30,7 @@ _UNKNOWN = StatusReply(
 """Before the first answer."""
 
 
-def cluster_view(cluster: Cluster, words: Words, runs: Runs, roots: Sequence[Path], *, acting: bool) -> View:
+def cluster_view(cluster: Cluster, words: Words, runs: Runs, roots: Sequence[Path]) -> View:
     """Workers, queue, history, and problems."""
     status = cluster.status or _UNKNOWN
     view = View("worker-rows", "open-rows")
@@ -56,7 +56,7 @@ def cluster_view(cluster: Cluster, words: Words, runs: Runs, roots: Sequence[Pat
     for worker in shown:
         plays = _plays(worker, names, by_run)
         ident_of = ident("worker", worker.worker)
-        view.row("worker-rows", "worker_row", ident_of, worker=worker, plays=plays, acting=acting)
+        view.row("worker-rows", "worker_row", ident_of, worker=worker, plays=plays)
     for run in status.runs[:PAGE_ROWS]:
         key = by_run[run.run].key if run.run in by_run else ""
         view.row("open-rows", "open_row", ident("open", run.run), run=run, key=key)

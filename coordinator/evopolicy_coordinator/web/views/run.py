@@ -11,7 +11,7 @@ from urllib.parse import urlencode
 
 from markupsafe import Markup
 
-from evopolicy_common.messages.status import RetriedJobs, StatusReply
+from evopolicy_common.messages.status import RetriedJobs
 from evopolicy_common.records import model_calls
 from evopolicy_common.records.policies.trees import changes
 from evopolicy_common.records.summary import utc_text
@@ -37,8 +37,6 @@ def run_view(
     reader: Reader,
     words: Words,
     *,
-    acting: bool,
-    status: StatusReply | None,
     retries: Sequence[RetriedJobs] = (),
 ) -> View:
     """One run: curve, submits, words, events. `retries`: the jobs of it that the cluster has played again."""
@@ -64,7 +62,6 @@ def run_view(
             title="Train returns over budget",
             caption="Mean visible train return of every ok submit, and the best so far.",
         ),
-        "actions": part("run_actions", run=run, acting=acting, classes=_classes(run, status)),
         "messages-more": part("messages_more", earlier=earlier, latest=latest, n=len(messages)),
         "look": part("identity", run=run, look=look, env_title=title_of(run.env)),
     }
@@ -138,18 +135,6 @@ def _curve(submits: Sequence[Submit], run: RunFacts, reference: tuple[str, float
     lines = [Line("mean train return", points, dots=True), Line("best so far", rising, steps=True)]
     title, x_title, x_max = "Train returns over budget", "train episodes consumed", float(run.budget or 0)
     return chart(title, x_title, lines, height=240.0, x_max=x_max, reference=reference)
-
-
-def _classes(run: RunFacts, status: StatusReply | None) -> list[str]:
-    """Classes of workers that could play the run, but get no work of it as it is pinned to another class."""
-    others = () if status is None else status.workers
-    return sorted(
-        {
-            worker.classes[run.env]
-            for worker in others
-            if run.run in worker.refused and run.env in worker.classes and worker.state != "lost"
-        }
-    )
 
 
 def submit_values(run: RunFacts, reader: Reader, index: int) -> dict[str, Any]:

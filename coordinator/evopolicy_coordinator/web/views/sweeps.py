@@ -31,9 +31,7 @@ MAX_CELLS = 300
 _TROUBLED = ("error", "unreadable", "no_ok_submit", "cancelled", "interrupted")
 
 
-def sweeps_view(
-    runs: Runs, cluster: Cluster | None, words: Words, roots: Sequence[Path], *, acting: bool
-) -> View:
+def sweeps_view(runs: Runs, cluster: Cluster | None, words: Words, roots: Sequence[Path]) -> View:
     """All runs: a matrix for each sweep, and one table."""
     every = [run for sweep in runs.sweeps for run in sweep.runs]
     agents = looks(sorted({run.entry for run in every}), None)
@@ -42,7 +40,7 @@ def sweeps_view(
     for sweep in runs.sweeps:
         name = ident("sweep", str(sweep.root))
         matrix, cells = _matrix(sweep, runs, agents, cells)
-        view.row("matrices", "matrix", name, key=name, acting=acting, **matrix)
+        view.row("matrices", "matrix", name, **matrix)
     shown, pages = paged(sorted(every, key=_order), words, _row_texts)
     view.parts |= {
         "facts": part("facts", facts=_sweep_facts(every)),
@@ -154,7 +152,6 @@ def _matrix(sweep: Sweep, runs: Runs, agents: Mapping[str, Look], most: int) -> 
         "envs": [(env, title_of(env)) for env in envs],
         "rows": rows,
         "left_out": len(sweep.runs) - len(shown),
-        "is_suite": sweep.is_suite,
         "paused": sweep.paused,
     }
     return view, most - len(shown)

@@ -95,21 +95,6 @@ def test_the_cluster_page_has_the_queue_by_priority_and_the_disks(tmp_path: Path
     assert str(tmp_path.resolve()) in page, "the disk of the runs here"
 
 
-def test_a_run_can_be_repinned_to_barred_classes_only(tmp_path: Path) -> None:
-    folder = open_run(tmp_path)
-    workers = (
-        worker("w-own", classes={"gym/acrobot": "class-own"}),
-        worker("w-new", classes={"gym/acrobot": "class-new"}, refused={"r-open": "other versions"}),
-        worker("w-gone", classes={"gym/acrobot": "class-gone"}, refused={"r-open": "versions"}, state="lost"),
-    )
-    reply = status(open_status("r-open"), workers=workers)
-    with client(site_of(tmp_path, cluster=reply, acting=True), "act") as operator:
-        page = operator.get(f"/run/{key(folder)}").text
-    assert "/act/run/r-open/repin?class=class-new" in page
-    assert "class-own" not in page
-    assert "class-gone" not in page
-
-
 def test_every_end_has_a_counter_and_a_place_in_the_legend(tmp_path: Path) -> None:
     ends = [("completed", None), ("cancelled", "stopped by its operator"), ("error", "no such model")]
     for number, (end, error) in enumerate([*ends, ("error", "401"), ("no_ok_submit", None)]):

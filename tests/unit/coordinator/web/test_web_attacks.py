@@ -34,7 +34,7 @@ import pytest
 from invented.web_site import (
     HOST,
     ORIGIN,
-    TOKENS,
+    TOKEN,
     client,
     finished_run,
     open_run,
@@ -49,7 +49,7 @@ from evopolicy_common.records.suite_folder import INDEX, Entry, Index
 from evopolicy_common.wire import http as server
 from evopolicy_coordinator.pki import certs
 from evopolicy_coordinator.web import app
-from evopolicy_coordinator.web.access import POLICY, kept_tokens
+from evopolicy_coordinator.web.access import POLICY, kept_token
 from evopolicy_coordinator.web.app import Site, listen, serve
 from evopolicy_coordinator.web.content.run_folders import key_of
 
@@ -62,66 +62,59 @@ def key(folder: Path) -> str:
     return key_of(str(folder.resolve()))
 
 
-def pause_of(root: Path) -> str:
-    """Where the sweep in a folder, which is made, is paused."""
-    (root / "suite.json").write_text('{"suite": "s", "runs": {}}')
-    return "/act/sweep/x" + key_of(f"sweep\n{root.resolve()}") + "/pause"
-
-
 # ---- who may read ----
 
 
 @pytest.mark.parametrize(
     "path",
     [
-        *("/", "/cluster", "/events/runs", "/run/x", "/run/x/file?path=a", "/act/run/r/cancel", "/log"),
+        *("/", "/cluster", "/events/runs", "/run/x", "/run/x/file?path=a"),
         *("/report/index.html", "/metrics"),
     ],
 )
 def test_nothing_is_disclosed_without_a_token_on_loopback_either(tmp_path: Path, path: str) -> None:
-    with client(site_of(tmp_path, acting=True), None) as stranger:
+    with client(site_of(tmp_path), signed_in=False) as stranger:
         assert stranger.get(path).status_code == 401
         assert stranger.get(path, headers={"accept": "text/html"}).headers["location"] == "/login"
         assert stranger.get(path, headers={"authorization": "Bearer " + "x" * 43}).status_code == 401
         if not path.startswith("/events"):  # which would not end
-            assert stranger.get(path, headers={"authorization": f"Bearer {TOKENS.read}"}).status_code != 401
+            assert stranger.get(path, headers={"authorization": f"Bearer {TOKEN}"}).status_code != 401
 
 
 def test_a_token_in_an_address_opens_nothing(tmp_path: Path) -> None:
-    with client(site_of(tmp_path), None) as stranger:
-        assert stranger.get(f"/?token={TOKENS.read}").status_code == 401
-        assert stranger.get(f"/login?token={TOKENS.read}").headers.get("set-cookie") is None
+    with client(site_of(tmp_path), signed_in=False) as stranger:
+        assert stranger.get(f"/?token={TOKEN}").status_code == 401
+        assert stranger.get(f"/login?token={TOKEN}").headers.get("set-cookie") is None
 
 
 def test_only_the_right_token_gets_a_strict_cookie(tmp_path: Path) -> None:
-    with client(site_of(tmp_path), None) as stranger:
+    with client(site_of(tmp_path), signed_in=False) as stranger:
         wrong = stranger.post("/login", content="token=no", headers={"origin": ORIGIN})
         assert (wrong.status_code, wrong.headers.get("set-cookie")) == (401, None)
-        cookie = stranger.post("/login", content=f"token={TOKENS.read}", headers={"origin": ORIGIN}).headers[
+        cookie = stranger.post("/login", content=f"token={TOKEN}", headers={"origin": ORIGIN}).headers[
             "set-cookie"
         ]
         assert "httponly" in cookie.lower()
         assert "samesite=strict" in cookie.lower()
-        assert TOKENS.read not in cookie
+        assert TOKEN not in cookie
 
 
 def test_no_answer_holds_a_token(tmp_path: Path) -> None:
     folder = open_run(tmp_path)
-    with client(site_of(tmp_path, acting=True), "act") as operator:
-        for path in (*PAGES, "/log"):
+    with client(site_of(tmp_path)) as operator:
+        for path in PAGES:
             text = operator.get(path.format(key=key(folder))).text
-            assert TOKENS.read not in text
-            assert TOKENS.act not in text
+            assert TOKEN not in text
 
 
 def test_a_token_file_that_others_may_read_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "tokens"
-    first = kept_tokens(path)
-    assert kept_tokens(path) == first
+    first = kept_token(path)
+    assert kept_token(path) == first
     assert path.stat().st_mode & 0o777 == 0o600
     path.chmod(0o644)
     with pytest.raises(ConfigError, match="chmod 600"):
-        kept_tokens(path)
+        kept_token(path)
 
 
 # ---- from where ----
@@ -164,13 +157,13 @@ ORIGINS = (
     ],
 )
 def test_a_post_that_another_sites_page_caused_does_nothing(tmp_path: Path, headers: dict[str, str]) -> None:
-    target = pause_of(tmp_path)
-    with client(site_of(tmp_path, acting=True), "act") as operator:
-        assert operator.get("/").status_code == 200
-        assert operator.post(target, headers=headers).status_code == 403
-        assert not (tmp_path / "paused").exists()
-        assert operator.post(target, headers={"origin": ORIGIN}).status_code == 303
-        assert (tmp_path / "paused").exists()
+    signed_in = f"token={TOKEN}"
+    with client(site_of(tmp_path), signed_in=False) as browser:
+        refused = browser.post("/login", content=signed_in, headers=headers)
+        assert (refused.status_code, refused.headers.get("set-cookie")) == (403, None)
+        assert browser.get("/").status_code == 401
+        assert browser.post("/login", content=signed_in, headers={"origin": ORIGIN}).status_code == 303
+        assert browser.get("/").status_code == 200
 
 
 def test_another_sites_page_cannot_load_our_files_or_events(tmp_path: Path) -> None:
@@ -270,47 +263,6 @@ async def test_a_request_that_does_not_end_is_not_waited_for(
         assert (await readers[0].read())[: len(answer) or None] == answer
 
 
-# ---- reading and acting ----
-
-
-@pytest.mark.parametrize("path", ["/act/run/r-1/cancel", "/act/worker/w/drain", "/log"])
-def test_the_reading_token_cannot_act(tmp_path: Path, path: str) -> None:
-    with client(site_of(tmp_path, acting=True), "read") as reader:
-        assert reader.get(path).status_code == 403
-        if path != "/log":
-            assert reader.post(path, headers={"origin": ORIGIN}).status_code == 403
-    assert not (tmp_path / "actions.jsonl").exists()
-
-
-def test_without_act_the_acting_token_is_none(tmp_path: Path) -> None:
-    with client(site_of(tmp_path), None) as stranger:
-        assert stranger.get("/", headers={"authorization": f"Bearer {TOKENS.act}"}).status_code == 401
-
-
-def test_an_act_is_confirmed_first_and_written_down(tmp_path: Path) -> None:
-    target = pause_of(tmp_path)
-    with client(site_of(tmp_path, acting=True), "act") as operator:
-        operator.get("/")
-        asked = operator.get(target)
-        assert "What happens" in asked.text
-        assert not (tmp_path / "paused").exists()
-        operator.post(target, headers={"origin": ORIGIN})
-        lines = (tmp_path / "actions.jsonl").read_text().splitlines()
-        assert ['"outcome":"asked"' in lines[0], '"outcome":"done"' in lines[1]] == [True, True]
-        assert "sweep pause" in operator.get("/log").text
-
-
-def test_an_act_that_cannot_be_done_is_reported_and_written_down(tmp_path: Path) -> None:
-    with client(site_of(tmp_path, acting=True, cluster=status(open_status("r-1"))), "act") as operator:
-        refused = operator.post("/act/run/r-1/cancel", headers={"origin": ORIGIN})
-        assert (refused.status_code, "Not done" in refused.text) == (409, True)
-        lines = (tmp_path / "actions.jsonl").read_text().splitlines()
-        assert ['"outcome":"asked"' in lines[0], '"outcome":"refused: ' in lines[1]] == [True, True]
-        unnamed = operator.post("/act/run/r-1/repin", content="class=x", headers={"origin": ORIGIN})
-        assert unnamed.status_code == 400
-        assert "evopolicy_workers" in operator.get("/metrics").text
-
-
 # ---- markup ----
 
 
@@ -342,8 +294,8 @@ def test_what_agents_wrote_is_text_on_every_page(tmp_path: Path) -> None:
         stalls=(MARKUP,),
         quarantined={MARKUP: MARKUP},
     )
-    with client(site_of(tmp_path, cluster=reply, acting=True), "act") as operator:
-        for path in (*PAGES, "/cluster", "/?q=" + "%3Cscript%3E", "/act/run/%3Cscript%3E/cancel"):
+    with client(site_of(tmp_path, cluster=reply)) as operator:
+        for path in (*PAGES, "/cluster", "/?q=" + "%3Cscript%3E"):
             answer = operator.get(path.format(key=key(folder)))
             assert answer.status_code == 200, path
             pieces = (
@@ -543,7 +495,7 @@ def test_a_served_report_waits_for_agents_and_allows_its_script(tmp_path: Path) 
         answer = reader.get("/report/index.html")
         assert answer.text == "<p>4242.5</p>"
         assert "script-src 'sha256-" in answer.headers["content-security-policy"]
-        assert reader.get("/report/../actions.jsonl").status_code in (403, 404)
+        assert reader.get("/report/../run.json").status_code in (403, 404)
 
 
 def test_the_host_header_decides_nothing_that_is_answered(tmp_path: Path) -> None:
