@@ -49,8 +49,6 @@ class RunSummary(msgspec.Struct, frozen=True, kw_only=True):
     """Why the agent's side ended, such as `budget_spent` or `agent_stopped`."""
     wall_s: float
     """Wall time from the run's opening to its end, seconds."""
-    in_question: bool
-    """Whether audits disputed one of its results, or found a forger among the workers that played it."""
 
 
 class SubmitRecord(msgspec.Struct, frozen=True, kw_only=True):
@@ -122,7 +120,6 @@ class Run:
             budget_used=outcome.budget_used,
             closed_reason=outcome.closed_reason,
             wall_s=record.timing.wall_time_seconds,
-            in_question=record.audit is not None and record.audit.in_question,
         )
 
     @property

@@ -44,7 +44,6 @@ class Refusal(StrEnum):
     # A worker is not admitted.
     BAD_NAME = "bad_name"
     NAME_TAKEN = "name_taken"
-    QUARANTINED = "quarantined"
     WRONG_PROTOCOL = "wrong_protocol"
 
     # Temporary.

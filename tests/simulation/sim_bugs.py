@@ -16,9 +16,9 @@ from evopolicy_coordinator.core import loading, machine
 from evopolicy_coordinator.core.agents import permits, precedence, requests
 from evopolicy_coordinator.core.isolation import conflicts, occupancies
 from evopolicy_coordinator.core.leasing import expiry, fleet, groups, leases, queue
-from evopolicy_coordinator.core.runs import audits, finalisation, finished, result_polls, submits
+from evopolicy_coordinator.core.runs import finalisation, finished, result_polls, submits
 from evopolicy_coordinator.core.structures.ledger import Ledger
-from evopolicy_coordinator.core.tables.model import JobGroup, Profile
+from evopolicy_coordinator.core.tables.model import Profile
 from evopolicy_coordinator.core.tables.related import CaseSets
 from evopolicy_coordinator.core.tables.state import State
 from evopolicy_coordinator.core.tables.step import Step
@@ -188,28 +188,6 @@ BUGS = (
         seed=26,
     ),
     Bug("refuse a worker that comes back", fleet, "of_session", 'if worker.state == "lost":', "if False:"),
-    Bug("let a worker audit itself", JobGroup, "excludes", "worker.name in self.not_on or", ""),
-    Bug(
-        "forget at a restart what is to be audited", audits, "resume", 'row.state != "open"', "True", seed=16
-    ),
-    Bug(
-        "wait for audits that nobody can play", finalisation, "check_audits", "if run is not None", "if False"
-    ),
-    Bug(
-        "call a forger who one other contradicts",
-        audits,
-        "compared",
-        "elif event.replay == 1:",
-        "elif False:",
-    ),
-    Bug(
-        "forget at a restart who is quarantined",
-        fleet,
-        "set_state",
-        "state.quarantined[name] = reason",
-        "pass",
-        seed=68,
-    ),
     Bug(
         "play hidden episodes beside an agent",
         conflicts,
@@ -367,5 +345,4 @@ BUGS = (
         "True",
         seed=25,
     ),
-    Bug("draw episodes anew at a restart", audits, "sample", "run.row.audit_share", "0.5"),
 )

@@ -19,12 +19,10 @@ from evopolicy_common.messages.worker import Message
 from evopolicy_coordinator.core.contract import events
 from evopolicy_coordinator.core.contract.effects import Log
 from evopolicy_coordinator.core.contract.records import (
-    AuditRow,
     OutcomeRow,
     Row,
     RunStateRow,
     SubmitRow,
-    WorkerRow,
     submit_group,
 )
 from evopolicy_coordinator.core.leasing import fleet
@@ -82,8 +80,6 @@ class Checkers:
         self.unreasoned = 0
         """Retries without a fault that explains them, in scenarios whose faults must cause none."""
         self.finished_runs: set[str] = set()
-        self.named: set[str] = set()
-        """Workers that were quarantined."""
 
     # ---- rows ----
 
@@ -97,11 +93,6 @@ class Checkers:
                 arrived[row.group] += 1
             elif isinstance(row, SubmitRow):
                 self._submit(row, rows)
-            elif isinstance(row, AuditRow):
-                self._audit(row)
-            elif isinstance(row, WorkerRow) and row.state == "quarantined":
-                want(row.worker == self._simulation.slanderer, "no honest worker is quarantined", row)
-                self.named.add(row.worker)
             elif isinstance(row, RunStateRow):
                 old = self._disk.states.get(row.run)
                 order = ("open", "closed", "finished")
@@ -110,15 +101,6 @@ class Checkers:
                 pinned = old is None or old.fingerprint_class in (None, row.fingerprint_class)
                 want(pinned, "a run keeps its fingerprint class", old, row)
 
-    def _audit(self, row: AuditRow) -> None:
-        """All players are honest, and all auditors but one."""
-        slandered = self._simulation.slanderer in row.replayed_by
-        want(slandered or (row.state != "disputed" and not row.difference), "honest workers agree", row)
-        want(not row.forger, "no honest player is called a forger", row)
-        old = self._disk.audits.get(row.audit)
-        want(old is None or old.state == "open", "an audit is settled once", old, row)
-        want(row.player not in row.replayed_by, "no worker audits its own episode", row)
-
     def _outcome(self, row: OutcomeRow, arrived: int) -> None:
         """`arrived` counts the rows of its group ahead of it in the transaction."""
         group = self._disk.outcomes.get(row.group, {})
@@ -126,8 +108,6 @@ class Checkers:
         want(row.seq == len(group) + arrived, "arrivals are numbered one by one", row, len(group), arrived)
         granted = self._granted_to.get((row.job_id, row.attempt))
         want(granted and granted[0] == row.worker, "outcomes come from the leased player", row, granted)
-        if "/audit-" in row.group:
-            return
         parts = row.group.split("/")
         if len(parts) == 3:
             submit = self._disk.submits.get((parts[0], int(parts[1][1:])))
@@ -223,8 +203,6 @@ class Checkers:
     def _taken(self, result: wire.JobResult) -> None:
         """Check an acknowledged result: the worker now drops it."""
         group = result.job_id.rpartition("/")[0]
-        if "/audit-" in group:
-            return
         job = None if self._core is None else self._core.state.jobs.get(result.job_id)
         if result.begun is not None and job is not None and self._attempts[job.job_id] == result.attempt:
             row = self._disk.begun.get((group, job.first))
@@ -247,7 +225,6 @@ class Checkers:
     def _leased(self, worker: str, lease: wire.Lease) -> None:
         core, disk, job = self._core, self._disk, lease.job
         group = job.job_id.rpartition("/")[0]
-        want(worker not in self.named, "a quarantined worker gets no work", worker, lease)
         known = self._granted.get(lease.lease_id)
         want(known is None, "an attempt is leased once", lease, known)
         highest = self._attempts.get(job.job_id, 0)
@@ -274,8 +251,6 @@ class Checkers:
         row = self._disk.begun.get((group, int(first)))
         want(job.begun == (None if row is None else row.begun), "what stands is gone on from", lease, row)
         for worker in self._simulation.workers.values():
-            if worker.name in self.named:
-                continue
             last, since = self._heard.get(worker.name, (-1e9, now))
             reported = [
                 each for each in worker.outbox if each.job_id == job.job_id and each.begun is not None
@@ -336,26 +311,9 @@ class Checkers:
                 reported,
                 each,
             )
-        self._audited(plan, result)
         got = (result.status, result.best_submit_index, result.heldout_returns, result.random_heldout_returns)
         wanted = (expected.status, expected.best, expected.heldout, expected.random)
         want(got == wanted, "a run comes to what it does without faults", plan.name, got, wanted)
-
-    def _audited(self, plan: PlannedRun, result: operator.RunFinished) -> None:
-        """Each drawn episode was confirmed, or the record gives the reason why not."""
-        share, audit = self._simulation.audit_share, result.audit
-        want((audit is None) == (share == 0.0), "audits are told where there are any", plan.name, audit)
-        if audit is None:
-            return
-        counted = audit.agreed + audit.disputed + sum(audit.not_audited.values())
-        want(counted == audit.sampled, "what was drawn is accounted for", audit)
-        want(set(audit.forgers) <= {self._simulation.slanderer}, "honest workers are not accused", audit)
-        played = sum(
-            len(rows)
-            for group, rows in self._disk.outcomes.items()
-            if group.startswith(f"{plan.name}/") and "/audit-" not in group
-        )
-        want(share < 1.0 or audit.sampled == played, "all are drawn when all are asked for", audit, played)
 
     # ---- the core ----
 

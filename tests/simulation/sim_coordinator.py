@@ -16,15 +16,11 @@ from sim_store import Disk
 from sim_world import World
 
 from evopolicy_common.messages import worker as wire
-from evopolicy_common.messages.episode import BlobRef
 from evopolicy_coordinator.core.contract import events
 from evopolicy_coordinator.core.contract.effects import (
-    AuditEffect,
-    CompareAudit,
     Effect,
     Log,
     Persist,
-    PrepareAudit,
     ReadEvaluation,
     ReadFinished,
     ReadResults,
@@ -39,8 +35,6 @@ from evopolicy_coordinator.server.reason_texts import message
 PAGE = 5
 """Most episodes in a page."""
 FLUSH_S = 0.004
-AUDIT_S = 0.5
-"""Longest time to read and compare a recording."""
 
 
 class Page:
@@ -177,34 +171,11 @@ class SimCoordinator:
                     return
                 self.checkers.committing(effect.rows)
                 self.disk.write(effect.rows)
-            elif isinstance(effect, AuditEffect):
-                world.after(AUDIT_S * world.chance.random(), self._audit, effect, self.life)
             else:
                 self._carry_out(effect)
                 if stormy and world.chance.random() < faults.coordinator_crash:
                     self.crash("after an effect")
                     return
-
-    def _audit(self, effect: PrepareAudit | CompareAudit, life: int) -> None:
-        """The shell's background work for an audit; here the reported return serves as the recording."""
-        if life != self.life or self.core is None or self._later(self._audit, effect, life):
-            return
-        played = self.disk.outcomes[effect.group][effect.index].outcome
-        event: events.AuditEvent
-        if isinstance(effect, PrepareAudit):
-            actions = BlobRef(digest=repr(played.episode_return), size=1)
-            event = events.AuditPrepared(run=effect.run, audit=effect.audit, actions=actions)
-        else:
-            replays = [self.disk.outcomes[group][0].outcome.episode_return for group in effect.replays]
-            event = events.AuditCompared(
-                run=effect.run,
-                audit=effect.audit,
-                replay=len(replays),
-                with_player=None if replays[-1] == played.episode_return else "another return",
-                with_first=None if replays[-1] == replays[0] else "another return",
-            )
-        self._take(self.core.handle(event, self.world.now))
-        self.checkers.stepped(self.core)
 
     def _reload(self) -> None:
         self.world.note("the disk refuses; the core is discarded")

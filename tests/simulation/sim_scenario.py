@@ -17,7 +17,6 @@ from sim_truth import Machine, Truth
 from sim_worker import SimWorker
 from sim_world import World
 
-from evopolicy_common.messages import worker as wire
 from evopolicy_common.messages.episode import EpisodeSpec, Job
 from evopolicy_common.messages.operator import SetWorker
 from evopolicy_coordinator.core.contract import events
@@ -26,7 +25,6 @@ from evopolicy_coordinator.server.reason_texts import words
 
 HORIZON_S = 1500.0
 """Simulated seconds after which an unfinished run counts as stuck."""
-AUDIT_WAIT_S = 60.0
 HIDDEN_WAIT_S = 20.0
 AGENT_WAIT_S = 300.0
 """Longer than any honest agent lives; in a crowd, which has no hostile gateway, much longer."""
@@ -110,17 +108,10 @@ class Simulation:
         self.checkers = Checkers(self)
         self.workers: dict[str, SimWorker] = {}
         self.gateways: list[SimGateway] = []
-        # One seed in four has audits; the others test the behaviour without them.
-        self.audit_share = (0.3, 1.0)[seed // 4 % 2] if seed % 4 == 0 else 0.0
         self._out_of_service = ("draining", "paused")[seed % 2]
         self.absent = {7: "frozen", 15: "paused"}.get(seed % 16)
         """How all workers become unavailable when the runs are opened."""
-        self.slanderer = "w1" if seed % 8 == 4 else None
-        """The worker that reports false replays as an auditor; players are honest, so all runs get
-        their expected results."""
         settings = CoreSettings(
-            audit_share=self.audit_share,
-            audit_wait_s=AUDIT_WAIT_S,
             hidden_wait_s=HIDDEN_WAIT_S,
             agent_wait_s=AGENT_WAIT_S * (10.0 if self.crowd else 1.0),
         )
@@ -252,8 +243,6 @@ class Simulation:
         operator = self.operators[0]
 
         def drained(message: object) -> None:
-            if isinstance(message, wire.Refused):
-                return  # the worker stays quarantined
             self.checkers.drained_at[name] = self.world.now
             operator.later(for_s, back)
 

@@ -7,7 +7,6 @@ from collections.abc import Iterable
 from rigs.core_rig import key_of
 
 from evopolicy_coordinator.core.contract.records import (
-    AuditRow,
     BegunRow,
     DocumentRow,
     EvaluationRow,
@@ -34,7 +33,6 @@ _TABLES: dict[type, str] = {
     FinishedRow: "finished",
     EvaluationRow: "evaluations",
     WorkerRow: "workers",
-    AuditRow: "audits",
     PermitRow: "permits",
     KernelRow: "kernels",
 }
@@ -53,7 +51,6 @@ class Disk:
         self.evaluations: dict[str, EvaluationRow] = {}
         self.finished: dict[str, FinishedRow] = {}
         self.workers: dict[str, WorkerRow] = {}
-        self.audits: dict[str, AuditRow] = {}
         self.permits: dict[tuple[str, str], PermitRow] = {}
         self.kernels: dict[str, KernelRow] = {}
         self.journal: list[JournalRow] = []
@@ -98,7 +95,6 @@ class Disk:
             begun=tuple(row for row in self.begun.values() if wanted(row.group)),
             evaluations=tuple(self.evaluations.values()),
             workers=tuple(self.workers.values()),
-            audits=tuple(row for row in self.audits.values() if row.run in live),
             permits=tuple(row for row in self.permits.values() if row.ended_at is None),
             kernels=tuple(self.kernels.values()),
             journal=self.journal[-1] if self.journal else None,

@@ -110,7 +110,7 @@ class Truth:
         name, _, rest = lease.job.job_id.partition("/")
         plan = next((each for each in self._simulation.plans if each.name == name), None)
         hidden = "/validation/" in f"/{rest}" or "/heldout/" in f"/{rest}"
-        train = "/train/" in f"/{rest}" and "/audit-" not in rest
+        train = "/train/" in f"/{rest}"
         if plan is None or not (hidden or train):
             return
         kind = "hidden" if hidden else "train"

@@ -1,5 +1,5 @@
 """A simulated worker: it registers, polls, sends heartbeats, plays and reports; it can crash, freeze, be slow, and fail
-jobs. One may slander: as an auditor it reports a false result of a replay.
+jobs.
 
 The result of a job depends on the job alone, as with a real worker; only its faults are random. The actions that the
 policy of a hidden episode has returned are named by their attempt, as if the clock had decided them, and returned with
@@ -168,16 +168,12 @@ class SimWorker(Asker):
             **describe(self.envs, self.version),
             "boot_id": self.boot_id if self.tells_kernel else "",
             "host": self.machine.name,
-            # Otherwise credentials alone would keep auditors apart.
-            "machine": self.machine.name if self.simulation.near else "",
+            "machine": self.machine.name,
         }
 
         def registered(message: Any) -> None:
             if isinstance(message, wire.Refused) and message.status == Refusal.NAME_TAKEN:
                 self.later(3.0, lambda: self._introduce(first=first))  # it tries again
-                return
-            if isinstance(message, wire.Refused):
-                self.life += 1  # quarantined: the worker ends
                 return
             self.session = message.session
             if first:
@@ -346,8 +342,7 @@ class SimWorker(Asker):
         if stormy and chance.random() < self.world.faults.worker_trouble:
             self._put(lease, "failed")
         else:
-            lies = self.name == self.simulation.slanderer
-            episodes = tuple(_outcome(job, spec, frozen_s, lies=lies) for spec in job.episodes)
+            episodes = tuple(_outcome(job, spec, frozen_s) for spec in job.episodes)
             self._put(lease, "done", episodes)
         self._start()
         self._poll()
@@ -373,9 +368,7 @@ def begun_of(lease: wire.Lease) -> BlobRef | None:
     return job.begun or BlobRef(digest=lease.lease_id, size=1)
 
 
-def _outcome(job: Job, spec: EpisodeSpec, frozen_s: float, *, lies: bool) -> EpisodeOutcome:
-    if spec.replay is not None:
-        return _episode(spec.index, float(spec.replay.digest) + lies, None)
+def _outcome(job: Job, spec: EpisodeSpec, frozen_s: float) -> EpisodeOutcome:
     category = failure_of(job.bundle, spec.index)
     failure = None if category is None else PolicyFailure(category=category, step_index=0, message="")
     value = return_of(spec.case.seed, job.bundle, spec.policy_seed, spec.episode_index, job.env_meta)

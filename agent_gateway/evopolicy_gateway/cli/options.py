@@ -54,7 +54,6 @@ Web = Annotated[
 ]
 
 _LOCAL_ONLY = {
-    "audit": "--audit applies only with --local; otherwise set it at the coordinator: evopolicy-coordinator --audit",
     "hidden_isolation": "--hidden-isolation applies only to a cluster started by this command; otherwise set it at the"
     " coordinator: evopolicy-coordinator --hidden-isolation",
     "policy_package": "--policy-package is for a cluster that this command brings up; give it to"

@@ -38,7 +38,7 @@ from evopolicy_gateway.suite import runs as plain_runs
 from evopolicy_gateway.suite.suite_index import exit_code
 
 app = App()
-_UNAUDITED = Shown(without=("audit", "hidden_isolation", "env_timeout", "env_memory"))
+_FOR_TRIES = Shown(without=("hidden_isolation", "env_timeout", "env_memory"))
 
 
 @app.command(epilog="Example: evopolicy run --env gym/acrobot --agent evolve --credentials operator-me")
@@ -52,7 +52,7 @@ def run(
     given: RunOptions,
     jail: JailSettings,
     served: ListenerOptions,
-    cluster: Annotated[ClusterOptions, Shown(without=("audit", "env_timeout", "env_memory"))],
+    cluster: Annotated[ClusterOptions, Shown(without=("env_timeout", "env_memory"))],
     web: options.Web = False,
     as_json: options.Json = False,
 ) -> None:
@@ -143,7 +143,7 @@ def try_policy(
     credentials_file: CredentialsFile = None,
     tier: Annotated[Tier, Of(RunOptions)],
     limits: Annotated[ResourceLimits, Of(RunOptions)],
-    cluster: Annotated[ClusterOptions, Shown(without=("audit", "hidden_isolation"))],
+    cluster: Annotated[ClusterOptions, Shown(without=("hidden_isolation",))],
     as_json: options.Json = False,
 ) -> None:
     """Play a policy on train cases, without a run or an agent.
@@ -221,7 +221,7 @@ def replay(
     ] = False,
     connect: Connect = None,
     credentials_file: CredentialsFile = None,
-    cluster: Annotated[ClusterOptions, _UNAUDITED],
+    cluster: Annotated[ClusterOptions, _FOR_TRIES],
 ) -> None:
     """Play a recorded run again: the same agent, with its model's answers from the record.
 

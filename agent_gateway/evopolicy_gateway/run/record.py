@@ -64,7 +64,7 @@ _SAME_DIMENSIONS = (
 _SAME_BOUNDS = ("n_train", "min_episodes_per_submit", "max_episodes_per_submit")
 """Fields of `Staged` that are dimensions too."""
 _SAME_SETTINGS = ("model", "env", "exp_id", "repeat", "attempt", "sandbox_tier")
-_SAME_RESULTS = ("env_title", "env_family", "run", "hidden_isolation", "audit", "committed")
+_SAME_RESULTS = ("env_title", "env_family", "run", "hidden_isolation", "committed")
 """Fields of the settings and of the finished run that `run.json` has under the same names."""
 
 

@@ -365,8 +365,6 @@ class ClusterOptions(msgspec.Struct, frozen=True, kw_only=True):
     """Use a temporary state folder: new cases, and no later comparison or `verify`."""
     data: Path | None = None
     """Folder of split files (`evopolicy data make`); default: derived from the state's secret."""
-    audit: Annotated[float, Meta(ge=0.0, le=1.0), Option(metavar="SHARE")] = 0.0
-    """Share of the episodes whose actions a second local worker replays, compared bit for bit."""
     hidden_isolation: Literal["related", "strict", "off"] | None = None
     """Agents beside which no hidden episode is played on a kernel: those of runs with the same hidden cases (related,
     the default), all (strict), or none (off)."""

@@ -90,7 +90,6 @@ def documents(played: PlayedRuns) -> list[dict[str, Any]]:
 
 def _document(run: Plan, played: PlayedRuns) -> dict[str, Any]:
     entry, record = played.index.runs[run.name], played.records.get(run.name)
-    audit = None if record is None else record.audit
     return {
         "env": entry.env,
         "run_directory": str(run.folder.root),
@@ -104,7 +103,6 @@ def _document(run: Plan, played: PlayedRuns) -> dict[str, Any]:
         "budget_used": entry.budget_used,
         "closed_reason": entry.closed_reason,
         "wall_s": entry.wall_s,
-        "in_question": audit is not None and audit.in_question,
         "wrong_option": run.name in played.wrong,
     }
 
@@ -145,9 +143,6 @@ def report(played: PlayedRuns, runs: Path, console: Terminal) -> None:
         made.add_row(one["env"], score, random, best, str(one["budget_used"]), shown)
     console.print(made)
     for one in results:
-        if one["in_question"]:
-            text = f"{one['env']}: audits put these results in question; see `audit` in run.json"
-            console.print(text, soft_wrap=True)
         if one["above_random"] is not None:
             console.print(f"{one['env']}: {_against_random(one['above_random'])}", soft_wrap=True)
         console.print(f"run directory: {one['run_directory']}", soft_wrap=True)

@@ -86,9 +86,8 @@ class LocalCluster:
     async def start_workers(
         self, env_ids: Sequence[str], *, slots: int, tiers: Collection[Tier] = ()
     ) -> None:
-        """Starts a worker that offers these environments, or one from each virtual environment that they need; in an
-        audited cluster two of each, which divide the slots. Workers of different virtual environments do not divide
-        them: they are rarely busy at the same time, and a slot that waits for an episode takes no processor time.
+        """Starts a worker that offers these environments, or one from each virtual environment that they need, with all
+        slots each: they are rarely busy at the same time, and a slot that waits for an episode takes no processor time.
 
         `tiers`: sandbox tiers that will be used. If one does not work here, the cluster fails with the remedy.
         """
@@ -96,19 +95,16 @@ class LocalCluster:
 
 
 async def _start_workers(
-    processes: _Processes, audited: bool, options: Sequence[str], credentials: Sequence[str], wanted: Workers
+    processes: _Processes, options: Sequence[str], credentials: Sequence[str], wanted: Workers
 ) -> None:
     notify_of_many_slots(wanted.slots)
-    suffixes = ("", "-2") if audited else ("",)
     for python, env_ids in installs.divided(wanted.env_ids).items():
         # --unsandboxed: whoever starts this cluster also chooses the tiers of its runs.
         program = [*_module("evopolicy_worker.cli", python), "--grace", "1", "--unsandboxed", *credentials]
         program += [*options, *_options([("--env", catalogue.source_of(env_id)) for env_id in env_ids])]
         program += _options([("--need-tier", tier) for tier in sorted(wanted.tiers)])
         own = "" if python == sys.executable else f"-{Path(python).parents[1].name}"
-        for k, suffix in enumerate(suffixes):
-            slots = max(1, -(-(wanted.slots - k) // len(suffixes)))
-            await processes.keep_up(f"worker{own}{suffix}", [*program, "--slots", str(slots)])
+        await processes.keep_up(f"worker{own}", [*program, "--slots", str(wanted.slots)])
 
 
 @contextlib.asynccontextmanager
@@ -117,7 +113,6 @@ async def local_cluster(
     *,
     state: Path | None = None,
     data: Path | None = None,
-    audit: float = 0.0,
     hidden_isolation: str | None = None,
     unjailed: bool = False,
     workers: Workers | None = None,
@@ -128,12 +123,11 @@ async def local_cluster(
 ) -> AsyncIterator[LocalCluster]:
     """A coordinator, open inside the `async with`; it and its workers are ended on exit. Enter it on the main thread.
 
-    `kind` names its logs and its folder. `state` None: a temporary folder. `audit`: share of the episodes that a second
-    worker replays, 0 to 1. `hidden_isolation`: the coordinator's option, None for its default. `unjailed`: agents could
-    read the folder; see the coordinator's `--unjailed-agents`. `policy_packages`: those that policies may import
-    besides numpy.
-    `browser`: the workers' Chromium; None for the machine's own. `env_timeout`, `env_memory`: the workers' options
-    (seconds, MiB), None for their defaults. `workers`: workers to start at once, in parallel with the coordinator.
+    `kind` names its logs and its folder. `state` None: a temporary folder. `hidden_isolation`: the coordinator's
+    option, None for its default. `unjailed`: agents could read the folder; see the coordinator's `--unjailed-agents`.
+    `policy_packages`: those that policies may import besides numpy. `browser`: the workers' Chromium; None for the
+    machine's own. `env_timeout`, `env_memory`: the workers' options (seconds, MiB), None for their defaults. `workers`:
+    workers to start at once, in parallel with the coordinator.
     Raises ConfigError when the coordinator does not start (the folder may be in use).
     """
     with contextlib.ExitStack() as folders:
@@ -160,7 +154,6 @@ async def local_cluster(
         packages = _options([("--policy-package", name) for name in policy_packages])
         own = {
             "--data": data and data.absolute(),
-            "--audit": audit or None,
             "--hidden-isolation": hidden_isolation,
         }
         place = ("--state", str(root), "--ready-file", str(ready_file), "--trust-workers")
@@ -170,7 +163,7 @@ async def local_cluster(
         limits = {"--browser": browser, "--env-timeout": env_timeout, "--env-memory": env_memory}
         worker_options = [*packages, *_options(limits.items())]
         processes = _Processes(root / "logs", kind, lock_fd)
-        start = partial(_start_workers, processes, bool(audit), worker_options)
+        start = partial(_start_workers, processes, worker_options)
         try:
             await processes.keep_up("coordinator", coordinator)
             if workers is not None:

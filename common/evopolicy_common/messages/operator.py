@@ -6,7 +6,6 @@ from typing import Literal
 
 import msgspec
 
-from evopolicy_common.messages.audit import AuditRecord, Committed
 from evopolicy_common.messages.bounds import Bytes, Int, Many, Named, Number, Numbered, Plain, Text, Word
 from evopolicy_common.messages.environment import (
     Case,
@@ -55,6 +54,23 @@ RunEnd = Literal["completed", "no_ok_submit", "error", "cancelled"]
 """`cancelled`: the operator ended the run. `error`: the run could not be completed."""
 
 
+class Committed(msgspec.Struct, frozen=True, kw_only=True):
+    """The coordinator's commitment before the run's agent started, with its journal entries. See `records.journal`."""
+
+    commitment: Word
+    """Salted SHA-256 (hex) of the run's splits and settings."""
+    epoch: Word
+    """The epoch of the run's cases: all runs of an epoch derive theirs from one secret."""
+    opened: Int
+    """Index of the journal entry that holds the commitment, from 0."""
+    opened_head: Word
+    """Hash (hex) of the journal up to that entry."""
+    ended: Int | None = None
+    """Index of the entry that holds the digest of the run's result; None until the run is finished."""
+    ended_head: Word = ""
+    """Hash (hex) of the journal up to that entry."""
+
+
 class RunFinished(msgspec.Struct, frozen=True, kw_only=True):
     """A finalised run as stored by the coordinator: the source of `run.json`."""
 
@@ -96,8 +112,6 @@ class RunFinished(msgspec.Struct, frozen=True, kw_only=True):
     infrastructure_retries: Int = 0
     nondeterministic_results: Int = 0
     """Repeated attempts of a job whose results differed."""
-    audit: AuditRecord | None = None
-    """None when nothing was audited and no forger is known."""
     hidden_isolation: HiddenIsolation = "unknown"
     fingerprint_overrides: Many[Text] = ()
     """`CLASS → CLASS: why` for each time an operator let the run continue with other versions, oldest first."""

@@ -31,7 +31,7 @@ class WorkerStatus(msgspec.Struct, frozen=True, kw_only=True):
     worker: Word
     host: Word
     slots: Int
-    state: Literal["active", "paused", "draining", "lost", "quarantined"]
+    state: Literal["active", "paused", "draining", "lost"]
     tiers: Many[Tier]
     environments: Many[Text]
     fingerprint: Text
@@ -115,7 +115,7 @@ class QueuedJobs(msgspec.Struct, frozen=True, kw_only=True):
     """The unfinished jobs of one priority and environment."""
 
     priority: Word
-    """`train`, `reference`, `heldout`, `validation` (of runs that are still open), `audit` or `hidden audit`."""
+    """`train`, `reference`, `heldout` or `validation` (of runs that are still open)."""
     env: Word
     runs: Int
     """Number of runs and evaluations."""
@@ -158,14 +158,6 @@ class StatusReply(Message, frozen=True, kw_only=True, tag="status_reply"):
     runs: Many[RunStatus]
     stalls: Many[Text] = ()
     """Items that have waited too long, with the reasons."""
-    audit_share: Number = 0.0
-    """Share of the episodes of new runs that is audited, 0 to 1."""
-    audits: Named[Int] = {}
-    """Audited episodes of the unfinished runs, by state (`open`, `agreed`, `disputed`, `not_audited`)."""
-    disputes: Many[Text] = ()
-    """Disagreements of workers, the latest last."""
-    quarantined: Named[Text] = {}
-    """Workers that get no more leases, with the reason."""
     turned_away: Many[TurnedAway] = ()
     queue: Many[QueuedJobs] = ()
     """Highest priority first."""

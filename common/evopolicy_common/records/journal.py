@@ -94,7 +94,6 @@ class Opening(msgspec.Struct, frozen=True, kw_only=True):
     """Whether the hidden cases are unpredictable."""
     allowed_imports: Many[Word]
     denied_imports: Many[Word]
-    audit_share: Number
     policy_seeds: Word
     """SHA-256 (hex) of the secret from which the policies' random seeds derive."""
 
@@ -170,7 +169,7 @@ _OWN = ("validation_ineligible", "submits", "record")
 def _record(finished: RunFinished) -> dict[str, Any]:
     sent = finished.agent.get("record")
     fields = {name: sent[name] for name in GATEWAY_SIDE if name in sent} if isinstance(sent, dict) else {}
-    audit, fingerprint = finished.audit, finished.fingerprint
+    fingerprint = finished.fingerprint
     hashes = {name: f"sha256:{digest}" for name, digest in finished.split_hashes.items()}
     for name, split in (("train", "train"), ("valid", "validation"), ("heldout", "heldout")):
         fields[f"versions.data_{name}_hash"] = hashes.get(f"{name}.json", hashes.get(split, ""))
@@ -188,7 +187,6 @@ def _record(finished: RunFinished) -> dict[str, Any]:
         "versions.fingerprint": {} if fingerprint is None else fingerprint.flat(),
         "versions.fingerprint_overrides": ["left out" for _ in finished.fingerprint_overrides],
         "versions.installations": list(finished.installations),
-        "audit": None if audit is None else msgspec.to_builtins(audit.counts()),
     }
 
 

@@ -37,7 +37,6 @@ EXCLUDED_FIELDS: Mapping[str, Mapping[str, str]] = {
         "outcome.auxiliary.infrastructure_retries": "counts what was played again",
         "rejected_submits.at": "a time",
         "committed": "the run's own place in the journal, and a random salt",
-        "audit": "which workers played, and played again",
         "versions.agents_md_hash": "of a file that names the gateway's port",
         "versions.installations": "which workers played; what decides their numbers is in versions.fingerprint",
     },

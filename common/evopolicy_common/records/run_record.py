@@ -16,7 +16,6 @@ from typing import Any, Literal
 import msgspec
 
 from evopolicy_common.errors import DECODE_ERRORS, ProtocolError
-from evopolicy_common.messages.audit import AuditRecord, Committed
 from evopolicy_common.messages.bounds import check_plausible
 from evopolicy_common.messages.environment import (
     FailedEpisodes,
@@ -28,7 +27,7 @@ from evopolicy_common.messages.environment import (
 )
 from evopolicy_common.messages.episode import FailureCategory, ResourceLimits, Tier
 from evopolicy_common.messages.gateway import FeedbackDetail, FinishRule, Profile, SimulationRule, VideoOption
-from evopolicy_common.messages.operator import RunEnd
+from evopolicy_common.messages.operator import Committed, RunEnd
 from evopolicy_common.messages.run_settings import HiddenCases, HiddenIsolation, Start
 from evopolicy_common.records.code_metrics import PUBLISHED_SCHEMA
 from evopolicy_common.records.model_record import Level
@@ -446,8 +445,6 @@ class RunRecord(msgspec.Struct, frozen=True, kw_only=True):
     artifacts: Artifacts = Artifacts()
     replays: tuple[Replay, ...] = ()
     versions: Versions
-    audit: AuditRecord | None = None
-    """Result of the audits on other workers; None without audits."""
     committed: Committed | None = None
     """The coordinator's commitment before the agent started; None for runs from before the journal."""
     start: Start | None = None

@@ -79,16 +79,6 @@ def serve(
             help="Package that policies may import in addition to numpy; may be repeated.",
         ),
     ] = None,
-    audit: Annotated[
-        float,
-        typer.Option(
-            min=0.0,
-            max=1.0,
-            metavar="SHARE",
-            help="Share of the episodes of new runs whose recorded actions a second worker replays, compared bit"
-            " for bit. If they differ, a third worker decides, and the forging worker gets no more work.",
-        ),
-    ] = 0.0,
     hidden_isolation: Annotated[
         Literal["related", "strict", "off"],
         typer.Option(
@@ -163,7 +153,6 @@ def serve(
         unjailed=unjailed_agents,
         trust_workers=trust_workers,
         core=CoreSettings(
-            audit_share=audit,
             hidden_isolation=hidden_isolation,
             hidden_wait_s=hidden_wait,
             agent_wait_s=agent_wait,

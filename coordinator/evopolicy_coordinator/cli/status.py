@@ -27,7 +27,7 @@ from evopolicy_common.messages.status import RunStatus, StatusReply, WorkerStatu
 from evopolicy_common.terminal import counted, duration, say, say_json, say_lines
 from evopolicy_common.wire import credentials, transport
 from evopolicy_common.wire.operator_client import OperatorClient
-from evopolicy_coordinator.web.content.remarks import abandoned, audits, lacks, remarks
+from evopolicy_coordinator.web.content.remarks import abandoned, lacks, remarks
 
 T = TypeVar("T")
 
@@ -146,7 +146,7 @@ def _command(name: str, state: Literal["active", "paused", "draining"], what: st
         async def work(operator: OperatorClient) -> None:
             if not absent:
                 reply = await operator.status()
-                known = {*(one.worker for one in reply.workers), *reply.quarantined}
+                known = {one.worker for one in reply.workers}
                 if worker not in known:
                     raise ConfigError(
                         f"no worker {worker!r} is connected; there are: {', '.join(sorted(known)) or 'none'}."
@@ -164,9 +164,7 @@ _command(
     "paused",
     "Give a worker no more work until it is resumed. It finishes its episodes and stays connected.",
 )
-_command(
-    "resume", "active", "Give work again to a worker that was paused, drained, or quarantined by an audit."
-)
+_command("resume", "active", "Give work again to a worker that was paused or drained.")
 
 
 @runs_app.command("list", epilog="Example: evopolicy runs list")
@@ -247,8 +245,6 @@ def render(reply: StatusReply) -> RenderableType:
         *_classes(reply),
         listing(reply.runs, _RUN_COLUMNS | _RUN_COUNTS, whole=("run",)),
     ]
-    if shown := audits(reply):
-        parts.append(Text(f"audits: {shown}"))
     waits = [f"{run.run} waits for {run.waits_for}" for run in reply.runs if run.waits_for]
     lines = itertools.chain(waits, *remarks(reply).values())
     return Group(*parts, *(Text(line, style="yellow") for line in lines))

@@ -9,7 +9,7 @@ Rules that this module owns:
 
 from __future__ import annotations
 
-from collections import Counter, defaultdict
+from collections import defaultdict
 from collections.abc import Callable
 
 from evopolicy_coordinator.core.agents import permits, requests
@@ -21,7 +21,7 @@ from evopolicy_coordinator.core.contract.records import (
 )
 from evopolicy_coordinator.core.isolation import occupancies
 from evopolicy_coordinator.core.leasing import fleet, pins
-from evopolicy_coordinator.core.runs import audits, evaluations, finalisation, runs, submits
+from evopolicy_coordinator.core.runs import evaluations, finalisation, runs, submits
 from evopolicy_coordinator.core.tables.model import Run
 from evopolicy_coordinator.core.tables.state import Loading, State
 from evopolicy_coordinator.core.tables.step import EpisodesDone, Step
@@ -32,22 +32,17 @@ def load(state: State, snapshot: Snapshot, step: Step, drain: Callable[[State, S
     loading = state.loading = Loading()
     state.journal = snapshot.journal
     state.revealed.update(snapshot.revealed)
-    played: dict[str, Counter[str]] = defaultdict(Counter)
     for head in snapshot.outcomes:
         loading.heads.setdefault(head.group, []).append(head)
-        if "/audit-" not in head.group:
-            played[head.group.partition("/")[0]][head.worker] += 1
     loading.begun.update({(row.group, row.first): row for row in snapshot.begun})
     for worker in snapshot.workers:
-        fleet.set_state(state, worker.worker, worker.state, worker.reason, worker.machine)
+        fleet.set_state(state, worker.worker, worker.state)
     stored = {row.run: row for row in snapshot.states}
     permits.load(state, snapshot.permits, {row.run: row for row in snapshot.runs}, stored, step)
     occupancies.load(state, snapshot.kernels, step)
-    submits_of, audits_of = defaultdict(list), defaultdict(list)
+    submits_of: dict[str, list[SubmitRow]] = defaultdict(list)
     for submit in snapshot.submits:
         submits_of[submit.run].append(submit)
-    for audit in snapshot.audits:
-        audits_of[audit.run].append(audit)
     for row in sorted(snapshot.runs, key=lambda row: (row.created_at, row.run)):
         last = stored.get(row.run, RunStateRow(run=row.run))
         if last.phase == "finished":
@@ -56,8 +51,6 @@ def load(state: State, snapshot: Snapshot, step: Step, drain: Callable[[State, S
             state.finished[row.run] = runs.last_state(last)
         else:
             run = runs.enter(state, row, last)
-            run.played = dict(played[row.run])
-            run.audits.update((each.audit, each) for each in audits_of[row.run])
             requests.resume(state, run, step)
             _run(state, run, submits_of[row.run], loading, step)
     for each in sorted(snapshot.evaluations, key=lambda row: (row.created_at, row.evaluation)):
@@ -104,7 +97,6 @@ def _run(state: State, run: Run, rows: list[SubmitRow], loading: Loading, step: 
             run.hidden_failures[submit_group(run.id, row.submit_index, "validation")] = failed
         elif row.status == "ok" and row.ineligible is None:
             finalisation.validate(state, run, row, step)
-    audits.resume(state, run, step)
     finalisation.advance(state, run, step)
 
 

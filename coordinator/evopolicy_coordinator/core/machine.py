@@ -24,7 +24,6 @@ from evopolicy_coordinator.core.contract.settings import CoreSettings
 from evopolicy_coordinator.core.isolation import occupancies
 from evopolicy_coordinator.core.leasing import expiry, fleet, queue
 from evopolicy_coordinator.core.runs import (
-    audits,
     evaluations,
     finalisation,
     finished,
@@ -166,29 +165,24 @@ EVENTS: dict[type, Rule] = {
     wire.ReportResults: membership.results_reported,
     events.LivenessLost: membership.liveness_lost,
     events.DescriptionAwaited: fleet.await_description,
-    events.AuditPrepared: audits.prepared,
-    events.AuditCompared: audits.compared,
 }
 """The rule for each event: by the message that it carries, or by its own type if it carries none."""
 
 
 NEWS: dict[tuple[type, str], tuple[Rule, ...]] = {
     (step.ResultsPersisted, ""): (results.take,),
-    (step.EpisodesDone, "train"): (audits.sample, submits.progressed),
+    (step.EpisodesDone, "train"): (runs.played, submits.progressed),
     **{
-        (step.EpisodesDone, kind): (audits.sample, finalisation.progressed)
+        (step.EpisodesDone, kind): (runs.played, finalisation.progressed)
         for kind in ("validation", "heldout", "random")
     },
     (step.EpisodesDone, "evaluation"): (evaluations.progressed,),
-    (step.EpisodesDone, "audit"): (audits.replayed,),
     **{
         (step.EnvironmentFailed, kind): (finalisation.environment_failed,)
         for kind in ("train", "validation", "heldout", "random")
     },
     (step.EnvironmentFailed, "evaluation"): (evaluations.environment_failed,),
-    (step.EnvironmentFailed, "audit"): (),  # its run waits for it for a limited time only
     (step.SubmitEnded, ""): (finalisation.submit_ended,),
-    (step.AuditsMoved, ""): (finalisation.audits_moved,),
     (step.AgentOverdue, ""): (finalisation.agent_overdue,),
     (step.FlowPinned, "run"): (runs.pinned,),
     (step.FlowPinned, "evaluation"): (evaluations.pinned,),
@@ -233,7 +227,6 @@ TIMERS: dict[str, Rule] = {
     "lane": _check_lane,
     "hidden": precedence.check_due,
     "submit": submits.limit_passed,
-    "audits": finalisation.check_audits,
     "linger": occupancies.expire,
     "ask": permits.ask_ended,
     "cancelled": permits.agent_ended,

@@ -14,10 +14,9 @@ from evopolicy_coordinator.core.contract.reasons import Reason
 from evopolicy_coordinator.core.contract.records import shared
 from evopolicy_coordinator.core.isolation import conflicts
 from evopolicy_coordinator.core.leasing import pins
-from evopolicy_coordinator.core.runs import audits, finished
+from evopolicy_coordinator.core.runs import finished
 from evopolicy_coordinator.core.runs.waits import waits_for
 from evopolicy_coordinator.core.tables.model import (
-    AUDIT,
     EARLY_VALIDATION,
     PRIORITY_NAMES,
     RANKS,
@@ -43,8 +42,6 @@ def status(state: State, now: float, words: Words) -> StatusReply:
     groups: dict[str, list[JobGroup]] = {}
     waits: dict[JobGroup, Reason] = {}
     for group in state.groups.values():
-        if group.kind == "audit":
-            continue
         groups.setdefault(group.run, []).append(group)
         if (reason := waits_for(state, group)) is not None:
             waits[group] = reason
@@ -59,10 +56,6 @@ def status(state: State, now: float, words: Words) -> StatusReply:
         workers=workers,
         runs=runs,
         stalls=_stalls(state, now, words),
-        audit_share=state.settings.audit_share,
-        audits=dict(Counter(row.state for run in state.runs.values() for row in run.audits.values())),
-        disputes=(*state.disputes, *audits.undecided(state)),
-        quarantined=dict(state.quarantined),
         queue=_queue(state, waits, words),
     )
 
@@ -130,7 +123,7 @@ def _run(
         phase=progress.phase,
         remaining_budget=run.ledger.available,
         n_submits=len(run.submits),
-        queued=sum(run.flow.n_ready[:AUDIT]),
+        queued=sum(run.flow.n_ready),
         running=run.flow.n_leased,
         done=run.ledger.settled + sum(group.done for group in groups),
         waits_for=words(waiting[0] if waiting else waits_at_end),
@@ -150,8 +143,6 @@ def _stalls(state: State, now: float, words: Words) -> tuple[str, ...]:
     stalls: list[str] = []
     limit_s = state.settings.stall_s
     for group in state.groups.values():
-        if group.kind == "audit":  # audits wait as long as any other work exists
-            continue
         waiting = [job for job in group.jobs.values() if job.lease is None and now - job.since > limit_s]
         reason = waits_for(state, group) if waiting else None
         if waiting and not (reason is not None and _yields(group, reason)):

@@ -9,7 +9,6 @@ Rules that this module owns:
 
 from __future__ import annotations
 
-import contextlib
 import threading
 from collections.abc import Callable, Collection, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -42,8 +41,7 @@ from evopolicy_common.refusals import Refusal
 from evopolicy_common.wire import codec
 from evopolicy_common.wire.transport import IncomingQuery
 from evopolicy_coordinator.core.contract import records
-from evopolicy_coordinator.core.contract.effects import AuditEffect, ReadEvaluation, ReadFinished, ReadResults
-from evopolicy_coordinator.core.contract.events import AuditEvent
+from evopolicy_coordinator.core.contract.effects import ReadEvaluation, ReadFinished, ReadResults
 from evopolicy_coordinator.core.contract.records import (
     DocumentRow,
     JournalRow,
@@ -81,17 +79,12 @@ class ServiceReader:
         self._uploads = uploads
         self._local = threading.local()
         self._pages = ThreadPoolExecutor(_READERS, thread_name_prefix="pages")
-        self._audits = ThreadPoolExecutor(1, thread_name_prefix="audits")
         self._lanes = [ThreadPoolExecutor(1, thread_name_prefix=f"blobs-{n}") for n in range(_BLOB_LANES)]
 
     def read(self, asked: Any, answer: Answer) -> None:
         """Replies to a `ReadEffect` of the core or an operator's request (`_READS`): with a page of results,
         outcomes of a finished run, published records of runs whose cases are disclosed, or a signature."""
         self._pages.submit(self._answer, partial(_READS[type(asked)], self, asked), answer)
-
-    def audit(self, effect: AuditEffect, tell: Callable[[AuditEvent], object]) -> None:
-        """Reads and compares recordings, one audit after another; calls `tell` from its thread."""
-        self._audits.submit(self._audit, effect, tell)
 
     def put(
         self,
@@ -178,7 +171,7 @@ class ServiceReader:
         return finished
 
     def close(self) -> None:
-        for pool in (self._pages, self._audits, *self._lanes):
+        for pool in (self._pages, *self._lanes):
             pool.shutdown(wait=True, cancel_futures=True)
 
     def _lane(self, digest: str) -> ThreadPoolExecutor:
@@ -204,19 +197,6 @@ class ServiceReader:
                 self._blobs.delete(digest, stored)
         except StorageError as error:
             log.error("an upload stays until `evopolicy-coordinator gc`", run=run, error=str(error))
-
-    def _audit(self, effect: AuditEffect, tell: Callable[[AuditEvent], object]) -> None:
-        # Needs numpy, which a coordinator without audits never imports.
-        from evopolicy_coordinator.server import auditing
-
-        try:
-            event = auditing.carry_out(effect, self._reader, self._blobs)
-        except Exception:
-            # The audit stays open until its timeout.
-            log.exception("cannot audit", audit=effect.audit)
-            return
-        with contextlib.suppress(RuntimeError):  # the loop is closed: the process is ending
-            tell(event)
 
     @property
     def _reader(self) -> Reader:

@@ -1,6 +1,6 @@
 """Texts of the core's reasons for operators, gateways and, through them, agents.
 
-Rule that this module owns: agents learn nothing of audits and of hidden results. Of the reasons why a submit waits,
+Rule that this module owns: agents learn nothing of hidden results. Of the reasons why a submit waits,
 an agent learns at most that it waits for hidden cases of another run to be scored.
 """
 
@@ -39,10 +39,8 @@ def _workers(
     if failed:
         # The reasons may name files and code of the environment, which are not for agents.
         return f"{wanted}; it failed on {', '.join(worker for worker, _ in failed)}"
-    # Agents must learn nothing of audits.
-    states = sorted("out of service" if state == "quarantined" else state for state in away)
-    if states:
-        return f"{wanted}: those that do are {' or '.join(states)}"
+    if away:
+        return f"{wanted}: those that do are {' or '.join(away)}"
     if not connected:
         # A worker that is still starting lacks nothing that has to be installed.
         return f"{wanted}; no worker is connected yet"
@@ -56,11 +54,6 @@ def _agent_alive(run: str, place: str) -> str:
         f"the agent of {run} to end, which may be alive {where}; if it is not, resume that run, or run"
         f" `evopolicy runs agent-gone {run}`; to end it, run `evopolicy runs cancel {run}`"
     )
-
-
-def _forger(worker: str, why: str, forger: str) -> str:
-    same = "" if forger == worker else f" (as {forger!r} of the same machine)"
-    return f"worker {worker!r} gets no more work here: {why}{same}"
 
 
 def _unknown_class(name: str, offered: tuple[str, ...]) -> str:
@@ -111,8 +104,6 @@ TEXTS: Mapping[str, str | Callable[..., str]] = {
         " NAME`)"
     ),
     "unknown_session": "the session of worker {worker!r} is unknown; register again",
-    "forger": _forger,
-    "quarantined": "{worker} is quarantined: {why}",
     "unknown_class": _unknown_class,
     "workers": _workers,
     "description": "a connected worker to describe {env}, as it does before its first episode",
@@ -128,7 +119,6 @@ TEXTS: Mapping[str, str | Callable[..., str]] = {
     "own_fault": "a retry after an infrastructure failure",
     "bench": "workers whose jobs kept failing to be tried again",
     "free_slot": FREE_SLOT,
-    "audits": "{n} audits of its episodes on other workers",
 }
 """By code: a text with placeholders for the reason's details, or a function of them."""
 

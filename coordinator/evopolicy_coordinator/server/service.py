@@ -37,8 +37,8 @@ from evopolicy_common.records.policies import bundles
 from evopolicy_common.refusals import Refusal
 from evopolicy_common.wire import codec
 from evopolicy_common.wire.transport import IncomingQuery
-from evopolicy_coordinator.core.contract.effects import AuditEffect, Effect, Log, ReadEffect, Refuse, Reply
-from evopolicy_coordinator.core.contract.events import AuditEvent, DescriptionAwaited, LivenessLost
+from evopolicy_coordinator.core.contract.effects import Effect, Log, ReadEffect, Refuse, Reply
+from evopolicy_coordinator.core.contract.events import DescriptionAwaited, LivenessLost
 from evopolicy_coordinator.core.contract.reasons import REFUSALS
 from evopolicy_coordinator.core.contract.settings import CoreSettings
 from evopolicy_coordinator.core.machine import Core
@@ -459,17 +459,8 @@ class Service:
             reply = message(effect, self._reader.state)
             self._refused_workers.answered(query.key, query.payload, reply, self.host.now())
             answer(reply)
-        elif isinstance(effect, AuditEffect):
-            soon, incarnation = self._loop.call_soon_threadsafe, self.host.incarnation
-            self._reader.audit(effect, lambda event: soon(self._audited, incarnation, event))
         elif isinstance(effect, Log):
             getattr(log, effect.level)(effect.event, stimulus=effect.stimulus_id, **effect.fields)
-
-    def _audited(self, incarnation: int, event: AuditEvent) -> None:
-        """Passes an audit's result to the core that requested it. A later core requests its own."""
-        if incarnation == self.host.incarnation and not self.host.stopping:
-            self.host.handle(event)
-            self.host.flush()
 
     def _sweep(self) -> None:
         """Periodically drops queries without a waiter (queries of lost workers are never answered), and uploads of runs

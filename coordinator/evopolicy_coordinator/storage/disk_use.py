@@ -25,7 +25,6 @@ from evopolicy_common.messages.status import DiskUse
 from evopolicy_common.records.blobs import BlobStore
 from evopolicy_common.wire.credentials import no_state
 from evopolicy_coordinator.core.contract.records import (
-    AuditRow,
     BegunRow,
     EvaluationRow,
     FinishedRow,
@@ -121,7 +120,6 @@ def collect(
                 _delete(db, bounds)
             for run in old_runs:
                 db.execute("DELETE FROM train_blobs WHERE run = ?", (run,))
-                db.execute("DELETE FROM audits WHERE run = ?", (run,))
             for digest in unnamed:
                 blobs.delete(digest)
             shrunk = _shrink(state, db)
@@ -221,7 +219,6 @@ def _named(
             named |= {ref.digest for ref in evaluation.replays} | {evaluation.bundle}
     train_blobs = db.execute("SELECT run, digest FROM train_blobs")
     named |= {digest for run, digest in train_blobs if run not in old_runs}
-    named |= {row.actions.digest for row in rows(db, AuditRow) if row.actions is not None}
     named |= {row.begun.digest for row in rows(db, BegunRow) if row.begun is not None}
     for row in rows(db, OutcomeRow, "WHERE grp NOT LIKE '%/train'"):
         head, _, tail = row.group.partition("/")

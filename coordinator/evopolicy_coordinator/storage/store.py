@@ -64,10 +64,6 @@ _MIGRATIONS: tuple[str, ...] = (
     CREATE TABLE claims (suite TEXT NOT NULL, name TEXT NOT NULL, data BLOB NOT NULL, PRIMARY KEY (suite, name));
     """,
     """
-    CREATE TABLE audits (audit TEXT PRIMARY KEY, run TEXT NOT NULL, data BLOB NOT NULL);
-    CREATE INDEX audits_by_run ON audits (run);
-    """,
-    """
     CREATE TABLE permits (
         run TEXT NOT NULL, boot_id TEXT NOT NULL, ended INTEGER NOT NULL, data BLOB NOT NULL,
         PRIMARY KEY (run, boot_id)
@@ -112,7 +108,6 @@ _PLACES: dict[type[Any], _Place] = {
     records.EvaluationRow: _Place("evaluations", ("evaluation",), ("key", "finished")),
     records.FinishedRow: _Place("finished", ("run",)),
     records.WorkerRow: _Place("workers", ("worker",)),
-    records.AuditRow: _Place("audits", ("audit",), ("run",)),
     records.PermitRow: _Place("permits", ("run", "boot_id"), ("ended",)),
     records.KernelRow: _Place("kernels", ("worker",)),
     records.JournalRow: _Place("journal", ("seq",), ("reveals",), replaced=False),
@@ -230,7 +225,6 @@ class Store:
             ),
             evaluations=evaluations,
             workers=tuple(rows(db, records.WorkerRow)),
-            audits=tuple(rows(db, records.AuditRow, f"WHERE run IN ({live_runs})")),
             permits=tuple(rows(db, records.PermitRow, "WHERE NOT ended")),
             kernels=tuple(rows(db, records.KernelRow)),
             journal=next(rows(db, records.JournalRow, "ORDER BY seq DESC LIMIT 1"), None),

@@ -44,6 +44,7 @@ _LIMITS = {
 _ALWAYS = (
     "No human played these cases: there is no human reference.",
     "A recording shows the actions that were played, not that the policy chose them.",
+    "Each episode counts as one worker reported it; `evopolicy verify` plays it again elsewhere.",
     "Returns of different environments have different scales, so there is no mean over environments.",
 )
 
@@ -243,7 +244,7 @@ def _agent(entry: str, sources: Sequence[Source]) -> AgentCost:
 def _conditions(records: Sequence[RunRecord]) -> dict[str, dict[str, dict[str, int]]]:
     counts: dict[str, dict[str, Counter[str]]] = {}
     for record in records:
-        use, audit, versions = record.agent.model_use, record.audit, record.versions
+        use, versions = record.agent.model_use, record.versions
         settings: dict[str, Any] = msgspec.to_builtins(record.experiment_dimensions)
         limits, resources = settings.pop("limits") or {}, record.agent.resources
         entry = catalogue.known(record.env)
@@ -256,10 +257,7 @@ def _conditions(records: Sequence[RunRecord]) -> dict[str, dict[str, dict[str, i
                 "hidden cases": "secret" if versions.data_secret else "public",
                 "rules": "renewed" if entry is not None and entry.world else "fixed",
             },
-            "metering": {
-                "tokens counted by": use.metering if use else unmetered,
-                "audits": f"{audit.agreed} of {audit.sampled} confirmed" if audit else "none",
-            },
+            "metering": {"tokens counted by": use.metering if use else unmetered},
             "hardware": {"processor": versions.fingerprint.get("cpu")},
             "agents' limits": msgspec.to_builtins(resources.limits) if resources else {},
             "software": {**versions.fingerprint, "cpu": None, "episodes repeat": versions.env_deterministic},
@@ -285,8 +283,6 @@ def _limits(
         limits.append("All runs of some cells have one score: they may be copies, and intervals too narrow.")
     if "agent" in values["tokens counted by"]:
         limits.append("Some token counts are the agent's own: nothing checked them.")
-    if "none" in values["audits"]:
-        limits.append("Some runs had no audits: one worker's word stands for each of their episodes.")
     return (*limits, *_ALWAYS)
 
 

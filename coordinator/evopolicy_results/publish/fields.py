@@ -17,8 +17,8 @@ import msgspec
 
 from evopolicy_common.catalogue.installs import Licence
 from evopolicy_common.errors import DECODE_ERRORS, ProtocolError
-from evopolicy_common.messages.audit import Committed
 from evopolicy_common.messages.episode import ResourceLimits
+from evopolicy_common.messages.operator import Committed
 from evopolicy_common.messages.run_settings import Start
 from evopolicy_common.records.run_record import Tokens
 from evopolicy_results.publish import contents
@@ -61,12 +61,11 @@ _RUN: dict[Cover, str] = {
         timing.queue_s timing.rollout_s timing.finalise_s outcome.closed_reason outcome.random_reference.seeded_by
         versions.env versions.env_deterministic versions.fingerprint.* versions.fingerprint_overrides.*
         versions.installations.* versions.data_train_hash versions.data_valid_hash versions.data_heldout_hash
-        versions.agents_md_hash versions.rules_hash versions.initial_policy_hash audit.share audit.sampled audit.audited
-        audit.agreed audit.disputed
+        versions.agents_md_hash versions.rules_hash versions.initial_policy_hash
     """,
     "removed": """
-        outcome.error outcome.policy_failures.*.message rejected_submits.*.message audit.not_audited.* audit.forgers.*
-        audit.findings.** artifacts.* replays.**
+        outcome.error outcome.policy_failures.*.message rejected_submits.*.message artifacts.*
+        replays.**
     """,
     "claim": """
         timing.agent_s timing.feedback_s timing.held_s timing.permit_s outcome.auxiliary.transitions.steps

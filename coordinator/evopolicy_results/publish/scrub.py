@@ -47,7 +47,6 @@ def record(full: RunRecord) -> tuple[RunRecord, list[Removed]]:
     }
     outcome, versions, replace = full.outcome, full.versions, msgspec.structs.replace
     for name, is_there, why in (
-        ("audit", full.audit is not None, "names workers; its counts are kept"),
         ("versions.fingerprint_overrides", versions.fingerprint_overrides, "an operator's own words"),
         ("outcome.error", outcome.error is not None, "may name paths and hosts"),
         ("rejected_submits.message", full.rejected_submits, "free text"),
@@ -70,7 +69,6 @@ def record(full: RunRecord) -> tuple[RunRecord, list[Removed]]:
         versions=replace(
             versions, fingerprint_overrides=tuple("left out" for _ in versions.fingerprint_overrides)
         ),
-        audit=None if full.audit is None else full.audit.counts(),
     )
     return kept, [Removed(what=what, why=why) for what, why in removed.items()]
 

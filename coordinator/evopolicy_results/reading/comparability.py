@@ -1,6 +1,5 @@
 """Settings that must agree within one comparison: budgets, policy scopes, splits, fingerprints, the agents'
-confinement, and whether hidden episodes and agents shared a kernel. Results that an audit disputes must not be mixed
-with others.
+confinement, and whether hidden episodes and agents shared a kernel.
 
 Settings of `_BY_SUITE` must agree over all runs of a suite, those of `_BY_ENTRY` over the runs of one entry, and those
 of `_BY_ENVIRONMENT` and the library fingerprint over the runs of one environment, since environments differ in them
@@ -70,7 +69,6 @@ def _named(mixtures: Sequence[Mixture]) -> Iterator[str]:
             yield f"    and {more} more values"
 
 
-IN_QUESTION = "results in dispute, or of a forger,"
 UNKNOWN_ISOLATION = "hidden isolation, where some runs do not tell it,"
 """Older runs without this record beside runs with it; their comparison needs an option of its own."""
 
@@ -177,7 +175,7 @@ REMEDIES = {
 
 
 def mixtures(runs: Iterable[Run]) -> list[Mixture]:
-    """Every difference between runs of one suite or environment, and disputed runs; empty for a fair comparison."""
+    """Every difference between runs of one suite or environment; empty for a fair comparison."""
     by_env = grouped(runs, lambda run: run.env)
     out: list[Mixture] = []
     for suite, envs in suites_of(by_env).items():
@@ -188,9 +186,6 @@ def mixtures(runs: Iterable[Run]) -> list[Mixture]:
     for env in ordered_environments(by_env):
         fingerprint = {"fingerprint": _Setting(_fingerprint_beside(by_env[env]))}
         out += _differences(_BY_ENVIRONMENT | fingerprint, env, by_env[env])
-        audits = [(run.name, run.record.audit) for run in by_env[env]]
-        if forged := [name for name, audit in audits if audit is not None and audit.in_question]:
-            out.append(Mixture(what=IN_QUESTION, where=env, values=dict.fromkeys(forged, 1)))
     return out
 
 

@@ -9,7 +9,7 @@ from evopolicy_coordinator.core.isolation.kernels import all_related, related
 from evopolicy_coordinator.core.structures import InvariantError
 from evopolicy_coordinator.core.tables.model import N_PRIORITIES, TRAIN, JobState
 from evopolicy_coordinator.core.tables.state import State
-from evopolicy_coordinator.core.tables.transitions import AUDIT, JOB, RUN, SUBMIT
+from evopolicy_coordinator.core.tables.transitions import JOB, RUN, SUBMIT
 
 
 def check_invariants(state: State) -> None:
@@ -17,7 +17,6 @@ def check_invariants(state: State) -> None:
     _jobs(state)
     _queue(state)
     _workers(state)
-    _audits(state)
     _isolation(state)
     for run in state.runs.values():
         parts = (run.ledger.available, run.ledger.reserved, run.ledger.settled)
@@ -74,17 +73,6 @@ def _isolation(state: State) -> None:
         want("", case_set.users == users[case_set], "a case set is kept while it has users")
     for group in state.held:
         want(group.id, group.held_since is not None and not group.closed, "only open groups are held")
-
-
-def _audits(state: State) -> None:
-    """An open audit is with the shell, or waits for a worker."""
-    for run in state.runs.values():
-        for row in run.audits.values():
-            n = len(row.replayed_by)
-            waits = AUDIT[row.state] and row.actions is not None and n == row.compared
-            playing = [k for k in range(1, n + 2) if f"{row.audit}.{k}" in state.groups]
-            want(row.audit, playing == ([n + 1] if waits else []), f"only the due audit is played: {playing}")
-            want(row.audit, row.player not in row.replayed_by, "no worker audits its own episode")
 
 
 def want(key: str, holds: object, what: str) -> None:

@@ -21,12 +21,9 @@ from evopolicy_common.messages.status import StatusReply
 from evopolicy_common.messages.worker import Message
 from evopolicy_coordinator.core.contract import events
 from evopolicy_coordinator.core.contract.effects import (
-    AuditEffect,
-    CompareAudit,
     Effect,
     Log,
     Persist,
-    PrepareAudit,
     ReadEvaluation,
     ReadFinished,
     ReadResults,
@@ -34,7 +31,6 @@ from evopolicy_coordinator.core.contract.effects import (
     Reply,
 )
 from evopolicy_coordinator.core.contract.records import (
-    AuditRow,
     BegunRow,
     EvaluationRow,
     FinishedRow,
@@ -102,8 +98,6 @@ class Rig:
         self.now = 1000.0
         self.replies: dict[events.RequestId, Any] = {}
         self.logs: list[Log] = []
-        self.audits: list[AuditEffect] = []
-        """The effects for audits that the shell has to carry out."""
         self.incarnation = 0
         self._requests = 0
         self.core = self.load()
@@ -128,7 +122,6 @@ class Rig:
             begun=of(BegunRow),
             evaluations=of(EvaluationRow),
             workers=of(WorkerRow),
-            audits=of(AuditRow),
             permits=tuple(row for row in of(PermitRow) if row.ended_at is None),
             kernels=of(KernelRow),
             journal=max(of(JournalRow), key=lambda row: row.seq, default=None),
@@ -174,8 +167,6 @@ class Rig:
                 case Reply() | Refuse():
                     assert effect.request not in self.replies, "one answer each"
                     self.replies[effect.request] = message(effect)
-                case PrepareAudit() | CompareAudit():
-                    self.audits.append(effect)
                 case ReadResults() | ReadEvaluation() | ReadFinished():
                     assert effect.request not in self.replies, "one answer each"
                     self.replies[effect.request] = effect

@@ -10,7 +10,7 @@ from evopolicy_common.console import Terminal, table
 
 ROWS = (
     ("w-attic-3f2a", "attic.example.org", "active", "12", "gym/acrobot gym/lunarlander"),
-    ("w-cellar-77aa", "cellar", "quarantined", "4", ""),
+    ("w-cellar-77aa", "cellar", "draining", "4", ""),
 )
 HEADINGS = ("worker", "host", "state", "slots", "environments")
 
@@ -42,7 +42,7 @@ def test_a_phone_gets_a_line_for_each_cell_that_is_not_empty() -> None:
         "",
         "worker  w-cellar-77aa",
         "host    cellar",
-        "state   quarantined",
+        "state   draining",
         "slots   4",
     ]
 

@@ -24,7 +24,7 @@ from invented.run_dirs import write_run
 from waiting import wait_until
 
 from evopolicy_common.records.rescores import Rescored, RescoreRecord, encode_rescore, rescore_path
-from evopolicy_results.reading.comparability import IN_QUESTION, UNKNOWN_ISOLATION, MixedRunsError, mixtures
+from evopolicy_results.reading.comparability import UNKNOWN_ISOLATION, MixedRunsError, mixtures
 from evopolicy_results.reading.parallel import Processes
 from evopolicy_results.reading.reader import count_changed_lines, find_run_dirs, load_runs, read_run, rescored
 from evopolicy_results.reading.records import rows
@@ -334,21 +334,6 @@ def test_prompts_must_agree_within_an_entry_and_may_differ_between_entries(tmp_p
     assert mixture.what == "prompts"
     assert "Agent B" in mixture.where
     assert mixtures([run for run in runs if "b" not in run.record.agent.prompts[7:]]) == []
-
-
-@pytest.mark.parametrize(
-    ("audit", "refused"),
-    [
-        ({"share": 0.05, "sampled": 4, "audited": 4, "agreed": 4}, False),
-        ({"share": 0.05, "sampled": 4, "not_audited": {"one worker only": 4}}, False),
-        ({"share": 0.05, "sampled": 4, "audited": 4, "agreed": 4, "forgers": {"w": 0}}, False),
-        ({"share": 0.05, "sampled": 4, "audited": 4, "agreed": 3, "disputed": 1}, True),
-        ({"share": 0.0, "forgers": {"w": 7}}, True),
-    ],
-)
-def test_a_run_that_its_audits_put_in_question_is_refused(tmp_path: Path, audit: dict, refused: bool) -> None:
-    write_run(tmp_path, VERSIONS, change={"audit": audit})
-    assert mixed(tmp_path) == [IN_QUESTION] * refused
 
 
 def test_a_run_continued_by_other_versions_is_set_apart(tmp_path: Path) -> None:

@@ -3,8 +3,8 @@
 Rules that this module owns:
 - The same steps give the same bytes. The rows are those of `json_text.rows_text`; observations outside the rows are one
   `.npz` file.
-- Beside the files is the log of actions, rewards and flags, as a trajectory with record "actions". Audits take the
-  actions from it, bit for bit as they were returned. The log contains nothing that the files do not.
+- Beside the files is the log of actions, rewards and flags, as a trajectory with record "actions": the
+  actions bit for bit as they were returned. The log contains nothing that the files do not.
 - Rows are compressed by blocks. Arrays outside the rows are held until the end, since a policy can measure the time
   between its calls; beyond `HELD_BYTES`, each that arrives has the oldest ones compressed.
 - Received bytes are not trusted: sizes are checked against the limits before anything is unpacked, and the rows against

@@ -88,29 +88,6 @@ class ReadFinished(msgspec.Struct, frozen=True, kw_only=True):
     run: str
 
 
-class AuditEffect(msgspec.Struct, frozen=True, kw_only=True):
-    """Read recordings for an audit of outcome `index` of `group`, in the background; an event follows."""
-
-    run: str
-    audit: str
-    group: str
-    index: int
-    stimulus_id: str = ""
-
-
-class PrepareAudit(AuditEffect, frozen=True, kw_only=True):
-    """Store the actions from the outcome's recording as a separate blob, without observations, rewards or
-    results, and raise `AuditPrepared`."""
-
-
-class CompareAudit(AuditEffect, frozen=True, kw_only=True):
-    """Compare the outcome at index 0 of the last group in `replays` with the audited one, and with the replay
-    before it, bit for bit; raise `AuditCompared`."""
-
-    replays: tuple[str, ...]
-    """One or two groups of one outcome each."""
-
-
 class Log(msgspec.Struct, frozen=True, kw_only=True):
     level: Literal["debug", "info", "warning", "error"]
     event: str
@@ -120,4 +97,4 @@ class Log(msgspec.Struct, frozen=True, kw_only=True):
 
 ReadEffect = ReadResults | ReadEvaluation | ReadFinished
 
-Effect = Persist | Reply | Refuse | ReadEffect | AuditEffect | Log
+Effect = Persist | Reply | Refuse | ReadEffect | Log

@@ -16,7 +16,6 @@ from typing import Any, Generic, TypeVar
 
 import msgspec
 
-from evopolicy_common.messages.episode import BlobRef
 from evopolicy_common.messages.operator import CreateRun, Disclose, Evaluate, Rescore
 from evopolicy_common.messages.worker import Message, Register
 from evopolicy_coordinator.core.contract.records import EvaluationRow, RunRow
@@ -44,7 +43,7 @@ class RunCreated(Requested[CreateRun], frozen=True, kw_only=True):
     """An operator requested a run; a known `key` returns the existing run."""
 
     row: RunRow
-    """Complete except for creation time, stimulus id and audit share. The id is fresh, and valid in a Zenoh key
+    """Complete except for creation time and stimulus id. The id is fresh, and valid in a Zenoh key
     (`keys.valid_name`)."""
 
 
@@ -87,37 +86,4 @@ class DescriptionAwaited(Event, frozen=True, kw_only=True):
     env: str
 
 
-# ---- audits ----
-
-
-class AuditPrepared(Event, frozen=True, kw_only=True):
-    """A `PrepareAudit` was carried out."""
-
-    run: str
-    audit: str
-    actions: BlobRef | None
-    """The stored actions; None when they are unavailable."""
-    error: str = ""
-    """Why the actions are unavailable."""
-    at_fault: bool = False
-    """True when the player's report is not a valid recording; False when the coordinator's own store is at fault."""
-
-
-class AuditCompared(Event, frozen=True, kw_only=True):
-    """A `CompareAudit` was carried out."""
-
-    run: str
-    audit: str
-    replay: int
-    """Number of the compared replay, from 1."""
-    with_player: str | None
-    """First difference from the player's report; None when they are equal."""
-    with_first: str | None = None
-    """First difference from the first replay; None when they are equal, or this is the first replay."""
-    error: str = ""
-    """Why they could not be compared, through no worker's fault."""
-
-
-AuditEvent = AuditPrepared | AuditCompared
-
-AnyEvent = Requested[Any] | LivenessLost | DescriptionAwaited | AuditEvent
+AnyEvent = Requested[Any] | LivenessLost | DescriptionAwaited

@@ -40,8 +40,6 @@ REFUSALS: dict[str, Refusal] = {
     "name_taken": Refusal.NAME_TAKEN,
     "no_room": Refusal.TOO_LARGE,
     "unknown_session": Refusal.UNKNOWN_WORKER,
-    "forger": Refusal.QUARANTINED,
-    "quarantined": Refusal.QUARANTINED,
     "unknown_class": Refusal.UNKNOWN_CLASS,
 }
 """The status of a refusal with that code."""

@@ -14,7 +14,6 @@ from typing import Any, Literal, TypeVar
 
 import msgspec
 
-from evopolicy_common.messages.audit import Committed
 from evopolicy_common.messages.environment import Case, EnvironmentDescription, Split
 from evopolicy_common.messages.episode import (
     BlobRef,
@@ -26,7 +25,7 @@ from evopolicy_common.messages.episode import (
     Tier,
 )
 from evopolicy_common.messages.gateway import SubmitDone, SubmitStatus
-from evopolicy_common.messages.operator import PlayedAs, RunFinished
+from evopolicy_common.messages.operator import Committed, PlayedAs, RunFinished
 from evopolicy_common.messages.run_settings import HiddenIsolation, RunSettings
 from evopolicy_common.messages.worker import Fingerprint
 
@@ -58,8 +57,6 @@ class RunRow(msgspec.Struct, frozen=True, kw_only=True, tag="run"):
     denied_imports: tuple[str, ...] = ()
     max_steps: int = 0
     """Steps after which an episode is truncated; 0: only its environment ends it."""
-    audit_share: float = 0.0
-    """Share of the run's episodes that are replayed on another worker, 0 to 1."""
     reference_by_case: bool = False
     """The random reference's actions follow from split and case; if False (rows of earlier versions), from `secret`."""
     epoch: str = ""
@@ -204,46 +201,10 @@ class FinishedRow(msgspec.Struct, frozen=True, kw_only=True, tag="finished"):
 
 
 class WorkerRow(msgspec.Struct, frozen=True, kw_only=True, tag="worker"):
-    """The state of a worker, set by an operator or an audit. Key: `worker`."""
+    """The state of a worker, set by an operator. Key: `worker`."""
 
     worker: str
-    state: Literal["active", "paused", "draining", "quarantined"]
-    reason: str = ""
-    """Why it is quarantined."""
-    machine: str = ""
-    """Machine whose workers are quarantined with it; empty for its own name alone."""
-
-
-class AuditRow(msgspec.Struct, frozen=True, kw_only=True, tag="audit"):
-    """An episode that was drawn for an audit. Key: `audit`."""
-
-    run: str
-    audit: str
-    """See `audits.audit_id`; the groups of its replays begin with it."""
-    group: str
-    index: int
-    """With `group`, the audited outcome's key."""
-    kind: Literal["train", "validation", "heldout", "random"]
-    """Of the group."""
-    submit_index: int
-    player: str
-    machines: tuple[str, ...] = ()
-    """Machines of the player and of its auditors, where they have credentials of their own."""
-    numerics: str
-    """The player's `Worker.numerics`; its auditors' must be equal."""
-    state: Literal["open", "agreed", "disputed", "not_audited"] = "open"
-    reason: str = ""
-    """Of the state, in words."""
-    actions: BlobRef | None = None
-    """The actions to replay, once they are stored and while the audit is open."""
-    replayed_by: tuple[str, ...] = ()
-    """Its auditors so far, in order; their outcomes are durable."""
-    compared: int = 0
-    """Number of replays that have been compared."""
-    difference: str = ""
-    """First difference between the player and the first auditor."""
-    forger: str = ""
-    """The player, if it was refuted."""
+    state: Literal["active", "paused", "draining"]
 
 
 class PermitRow(msgspec.Struct, frozen=True, kw_only=True, tag="permit"):
@@ -296,7 +257,6 @@ Row = (
     | EvaluationRow
     | FinishedRow
     | WorkerRow
-    | AuditRow
     | PermitRow
     | KernelRow
     | JournalRow
@@ -336,7 +296,7 @@ def head_of(row: OutcomeRow) -> OutcomeHead:
 class Snapshot(msgspec.Struct, frozen=True, kw_only=True):
     """All that a core is loaded from, read in one transaction.
 
-    `runs` and `states` are complete (finished runs too: their keys and capabilities stay known). `submits`, `audits`,
+    `runs` and `states` are complete (finished runs too: their keys and capabilities stay known). `submits`,
     `outcomes` and `begun` are needed only for runs whose phase is not `finished`, and the last two also for evaluations
     that are not finished; more does no harm. Order does not matter.
     """
@@ -350,7 +310,6 @@ class Snapshot(msgspec.Struct, frozen=True, kw_only=True):
     begun: tuple[BegunRow, ...] = ()
     evaluations: tuple[EvaluationRow, ...] = ()
     workers: tuple[WorkerRow, ...] = ()
-    audits: tuple[AuditRow, ...] = ()
     permits: tuple[PermitRow, ...] = ()
     """Those that have not ended, of finished runs too."""
     kernels: tuple[KernelRow, ...] = ()

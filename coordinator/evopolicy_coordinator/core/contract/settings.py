@@ -50,10 +50,6 @@ class CoreSettings(msgspec.Struct, frozen=True, kw_only=True):
     """Waits longer than this are listed among the stalls."""
     fingerprint_cpu: bool = False
     """Whether a worker's fingerprint class includes the CPU's features, besides packages and code."""
-    audit_share: float = 0.0
-    """Share of the episodes of new runs, 0 to 1, whose recorded actions are replayed on another worker."""
-    audit_wait_s: float = 300.0
-    """A run that is otherwise done waits for its audits at most this long."""
     hidden_isolation: Literal["related", "strict", "off"] = "related"
     """Which agents and train jobs keep hidden jobs from a kernel: of runs that share a hidden case, all, or none."""
     hidden_wait_s: float = 60.0

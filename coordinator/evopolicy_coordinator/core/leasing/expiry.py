@@ -1,4 +1,4 @@
-"""Expiry of leases: the worker fell silent, does not name the lease, holds it for too long, or is quarantined.
+"""Expiry of leases: the worker fell silent, does not name the lease, or holds it for too long.
 
 Rules that this module owns:
 - A lease that no heartbeat names for a time to live is given up. No lease expires while the loop itself may have been
@@ -69,13 +69,6 @@ def lose(state: State, worker: Worker, step: Step) -> None:
     step.log("warning", "worker_lost", worker=worker.name, held=len(worker.leases), running=len(running))
     _take_all(state, worker, "worker_lost", (), running, step)
     state.timers.arm(("forget", worker.name), step.now + FORGET_S)
-
-
-def take_away(state: State, name: str, step: Step) -> None:
-    """Take all jobs back from a quarantined worker, without suspicion, and end its polls."""
-    worker = state.workers.get(name)
-    if worker is not None:
-        _take_all(state, worker, "returned", tuple(worker.leases), set(), step)
 
 
 def _take_all(

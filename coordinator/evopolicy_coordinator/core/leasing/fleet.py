@@ -5,7 +5,7 @@ Rules that this module owns:
   the new session may claim them for a short while, then they are lost like a lost worker's.
 - Workers of one profile (environments with their fingerprint classes, tiers) are interchangeable except for their warm
   environments and bundles.
-- A worker that is paused, draining, lost, quarantined, benched or reserved for a suspect gets no more work. A draining
+- A worker that is paused, draining, lost, benched or reserved for a suspect gets no more work. A draining
   worker is requested to end after its present jobs; a paused one stays, and works as before once it is set active.
 - A worker whose jobs keep failing through its own fault is benched: it gets no leases for a growing time.
 """
@@ -134,7 +134,7 @@ def count_in(state: State, worker: Worker) -> None:
         worker.profile.slots += worker.slots
 
 
-def count_out(worker: Worker, state: Literal[OutOfService, "lost", "quarantined"] = "lost") -> None:
+def count_out(worker: Worker, state: Literal[OutOfService, "lost"] = "lost") -> None:
     """Take a worker out of service: it gets no more work."""
     if worker.state == "active":
         del worker.profile.workers[worker.name]
@@ -146,24 +146,11 @@ def count_out(worker: Worker, state: Literal[OutOfService, "lost", "quarantined"
         worker.reserved = None
 
 
-def set_state(
-    state: State,
-    name: str,
-    to: Literal["active", OutOfService, "quarantined"],
-    reason: str = "",
-    machine: str = "",
-) -> None:
-    """Apply a state set by an operator or an audit; also for a worker that is not connected."""
+def set_state(state: State, name: str, to: Literal["active", OutOfService]) -> None:
+    """Apply a state set by an operator; also for a worker that is not connected."""
     state.out_of_service.pop(name, None)
-    if state.quarantined.pop(name, None) is not None:
-        machines = state.quarantined_machines
-        state.quarantined_machines = {each: of for each, of in machines.items() if of != name}
-    if to == "draining" or to == "paused":
+    if to != "active":
         state.out_of_service[name] = to
-    elif to == "quarantined":
-        state.quarantined[name] = reason
-        if machine:
-            state.quarantined_machines[machine] = name
     worker = state.workers.get(name)
     if worker is None or worker.state in ("lost", to):
         return

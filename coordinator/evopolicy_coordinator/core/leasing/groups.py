@@ -1,4 +1,4 @@
-"""Groups of jobs: a submit's train episodes, a checkpoint's hidden ones, an evaluation's, an audit's replay.
+"""Groups of jobs: a submit's train episodes, a checkpoint's hidden ones, an evaluation's.
 
 Rules that this module owns:
 - A group is a list of episodes with indexes 0 … n − 1, cut into jobs; each index gets exactly one outcome.

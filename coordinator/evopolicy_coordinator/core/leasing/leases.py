@@ -172,7 +172,6 @@ def _adopt(state: State, worker: Worker, item: wire.HeldLease, step: Step) -> Le
         or job.lease is not None
         or item.attempt in job.held_attempts
         or not granted(state, item.lease_id, item.job_id, item.attempt, worker)
-        or job.group.excludes(worker)
         or not conflicts.adoptable(state, job, worker)
     ):
         return None

@@ -8,8 +8,7 @@ Rules that this module owns:
   virtual clock; an idle flow starts at the clock, so that idleness earns nothing). A worker that has the environment or
   the bundle warm may deviate from this by a bounded amount.
 - Within a flow jobs go in order; jobs that return after a failure go to the front.
-- A job is not leased to a worker that it avoids while its lane has another one, and never to a worker that its group
-  excludes.
+- A job is not leased to a worker that it avoids while its lane has another one.
 - No operation visits all jobs, all flows or all workers: flows are in heaps, removed entries are void by ticket.
 """
 
@@ -276,7 +275,7 @@ def _first(flow: Flow, priority: int, worker: Worker, now: float, *, sole: bool)
         ticket, job = ready[0]
         if job.ticket != ticket:
             ready.popleft()
-        elif (job.avoid == worker.name and now < job.avoid_until and not sole) or job.group.excludes(worker):
+        elif job.avoid == worker.name and now < job.avoid_until and not sole:
             skipped.append(ready.popleft())
         else:
             best = job

@@ -1,1 +1,1 @@
-"""Runs and evaluations, from their creation to their result: submits, results, validation, selection, audits."""
+"""Runs and evaluations, from their creation to their result: submits, results, validation, selection."""

@@ -29,7 +29,6 @@ from evopolicy_coordinator.core.contract.records import (
 )
 from evopolicy_coordinator.core.leasing import groups, queue
 from evopolicy_coordinator.core.runs import (
-    audits,
     evaluations,
     finished,
     journal,
@@ -41,7 +40,6 @@ from evopolicy_coordinator.core.tables.model import HELDOUT, JobGroup, Run
 from evopolicy_coordinator.core.tables.state import State
 from evopolicy_coordinator.core.tables.step import (
     AgentOverdue,
-    AuditsMoved,
     EnvironmentFailed,
     EpisodesDone,
     Step,
@@ -90,18 +88,6 @@ def submit_ended(state: State, news: SubmitEnded, step: Step) -> None:
     advance(state, news.run, step)
 
 
-def audits_moved(state: State, news: AuditsMoved, step: Step) -> None:
-    """An audit of a run ended or advanced: the run may have waited for it."""
-    advance(state, news.run, step)
-
-
-def check_audits(state: State, name: str, step: Step) -> None:
-    """The deadline of a run that waits for its audits: check whether a worker can still play them."""
-    run = state.runs.get(name)
-    if run is not None:
-        advance(state, run, step)
-
-
 # ---- stages ----
 
 
@@ -145,7 +131,7 @@ def advance(state: State, run: Run, step: Step) -> None:
     if best is not None and submit_group(run.id, best.submit_index, "heldout") not in run.hidden_returns:
         _open(state, templates.hidden("heldout", run, best, step), step)
         return
-    if has_reference and not audits.holds_up(state, run, step):
+    if has_reference:
         _finish(state, run, best, step)
 
 
@@ -207,8 +193,6 @@ def _finish(
 ) -> None:
     """End a run: its result becomes durable, and the core drops its state. `unplayed`: close its
     open groups unfinished. `error`: why it cannot be scored."""
-    audits.cancel(state, run, step)
-    state.timers.disarm(("audits", run.id))
     for group in [group for group in state.groups.values() if group.run == run.id] if unplayed else []:
         groups.close_group(state, group, step)
     result = finished.result(state, run, best, step.now, cancelled=cancelled, error=error)

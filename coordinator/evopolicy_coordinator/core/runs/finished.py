@@ -16,7 +16,7 @@ from evopolicy_coordinator.core.contract.records import (
     shared,
     submit_group,
 )
-from evopolicy_coordinator.core.runs import audits, waits
+from evopolicy_coordinator.core.runs import waits
 from evopolicy_coordinator.core.structures.polls import Poll
 from evopolicy_coordinator.core.tables.model import Run
 from evopolicy_coordinator.core.tables.state import State
@@ -121,7 +121,6 @@ def result(
             if each.env_instances and not each.refunded
         ),
         wall_s={"queue": run.queue_s, "rollout": run.rollout_s, "finalise": max(0.0, now - closed_at)},
-        audit=audits.record(state, run),
         hidden_isolation=stored.isolation,
         fingerprint_overrides=stored.overrides,
     )
@@ -171,5 +170,5 @@ def progress(state: State, run: Run) -> tuple[operator.RunProgress, Reason | Non
         phase, group = "random", state.groups.get(random_group(run.id))
     total = len(run.row.heldout)
     if group is None:
-        return operator.RunProgress(phase=phase, done=total, total=total), audits.waits_for(run)
+        return operator.RunProgress(phase=phase, done=total, total=total), None
     return operator.RunProgress(phase=phase, done=group.done, total=total), waits.waits_for(state, group)

@@ -13,8 +13,7 @@ import hashlib
 
 import msgspec
 
-from evopolicy_common.messages.audit import Committed
-from evopolicy_common.messages.operator import Done, RunFinished
+from evopolicy_common.messages.operator import Committed, Done, RunFinished
 from evopolicy_common.records import journal
 from evopolicy_coordinator.core.contract import events
 from evopolicy_coordinator.core.contract.reasons import NotDoneError

@@ -23,7 +23,10 @@ from evopolicy_coordinator.core.runs import journal, waits
 from evopolicy_coordinator.core.structures.ledger import Ledger
 from evopolicy_coordinator.core.tables.model import Flow, Run
 from evopolicy_coordinator.core.tables.state import State
-from evopolicy_coordinator.core.tables.step import FlowPinned, JobRetried, ResultsDiffered, Step
+from evopolicy_coordinator.core.tables.step import EpisodesDone, FlowPinned, JobRetried, ResultsDiffered, Step
+
+MOST_INSTALLATIONS = 64
+"""A run's record names no more: a worker may register as often as it wants, each time with another one."""
 
 
 def create(state: State, event: events.RunCreated, step: Step) -> None:
@@ -39,7 +42,6 @@ def create(state: State, event: events.RunCreated, step: Step) -> None:
         raise NotDoneError("run_exists", run=row.run)
     row = msgspec.structs.replace(
         row,
-        audit_share=state.settings.audit_share,
         reference_by_case=True,
         created_at=step.now,
         stimulus_id=step.stimulus_id,
@@ -182,6 +184,15 @@ def pinned(state: State, news: FlowPinned, step: Step) -> None:
         fingerprint=profile.fingerprints[news.flow.env],
     )
     step.log("info", "run_pinned", run=run.id, fingerprint_class=profile.classes[news.flow.env])
+
+
+def played(state: State, news: EpisodesDone, step: Step) -> None:
+    """Note the installation of a worker that has played some of a run's episodes."""
+    run, name = state.runs.get(news.group.run), "" if news.worker is None else news.worker.installation
+    if run is not None and name:
+        known = run.state.installations
+        if name not in known and len(known) < MOST_INSTALLATIONS:
+            step.change_run(run, installations=(*known, name))
 
 
 def retried(state: State, news: JobRetried, step: Step) -> None:

@@ -11,7 +11,6 @@ from evopolicy_common.messages.environment import Case
 from evopolicy_common.messages.operator import PlayedAs
 from evopolicy_common.messages.run_settings import RunSettings
 from evopolicy_coordinator.core.contract.records import (
-    AuditRow,
     EvaluationRow,
     RunRow,
     SubmitRow,
@@ -21,10 +20,8 @@ from evopolicy_coordinator.core.contract.records import (
 )
 from evopolicy_coordinator.core.leasing.jobs import occurrences
 from evopolicy_coordinator.core.tables.model import (
-    AUDIT,
     EARLY_VALIDATION,
     HELDOUT,
-    HIDDEN_AUDIT,
     REFERENCE,
     TRAIN,
     Evaluation,
@@ -136,33 +133,6 @@ def evaluation(of: Evaluation, step: Step) -> JobGroup:
         replays=row.replays,
         indexes=place.indexes,
     )
-
-
-def audit(run: Run, row: AuditRow, step: Step) -> JobGroup:
-    """The next replay of an audited episode's actions."""
-    assert row.actions is not None
-    if row.kind == "train":
-        case = run.row.train[run.submits[row.submit_index].env_instances[row.index]]
-    else:
-        case = (run.row.validation if row.kind == "validation" else run.row.heldout)[row.index]
-    group = _group(
-        "audit",
-        run,
-        (case,),
-        step,
-        id=f"{row.audit}.{len(row.replayed_by) + 1}",
-        submit_index=row.submit_index,
-        priority=HIDDEN_AUDIT if row.kind in HIDDEN_SPLITS else AUDIT,
-        stimulus_id=step.stimulus_id,
-        env_meta={"env": run.row.settings.env},
-        case_ids=(row.index,),
-        record="full" if row.kind == "train" else "actions",
-        replays=(row.actions,),
-    )
-    group.not_on = frozenset((row.player, *row.replayed_by))
-    group.not_of = frozenset(row.machines)
-    group.numerics = row.numerics
-    return group
 
 
 def _group(

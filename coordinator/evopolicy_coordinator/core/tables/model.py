@@ -13,8 +13,6 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import Any, Literal, NamedTuple, TypeVar
 
-import msgspec
-
 from evopolicy_common.messages.environment import (
     Case,
     EnvironmentDescription,
@@ -36,7 +34,6 @@ from evopolicy_common.messages.worker import Fingerprint
 from evopolicy_common.records.aggregates import mean
 from evopolicy_coordinator.core.contract.events import RequestId
 from evopolicy_coordinator.core.contract.records import (
-    AuditRow,
     EvaluationRow,
     PermitRow,
     RunRow,
@@ -52,17 +49,17 @@ T = TypeVar("T")
 # ---- jobs ----
 
 
-TRAIN, REFERENCE, HELDOUT, EARLY_VALIDATION, AUDIT, HIDDEN_AUDIT = range(6)
+TRAIN, REFERENCE, HELDOUT, EARLY_VALIDATION = range(4)
 """Priorities. Validation of a closed run and evaluations on hidden cases have `HELDOUT`, the random reference and other
-evaluations `REFERENCE`, audits of `HIDDEN` jobs `HIDDEN_AUDIT`."""
-N_PRIORITIES = 6
-PRIORITY_NAMES = ("train", "reference", "heldout", "validation", "audit", "hidden audit")
+evaluations `REFERENCE`."""
+N_PRIORITIES = 4
+PRIORITY_NAMES = ("train", "reference", "heldout", "validation")
 """As `QueuedJobs.priority`."""
-RANKS = ((TRAIN,), (REFERENCE, HELDOUT), (EARLY_VALIDATION,), (AUDIT, HIDDEN_AUDIT))
+RANKS = ((TRAIN,), (REFERENCE, HELDOUT), (EARLY_VALIDATION,))
 """Each rank of priorities gets fair shares of what the ranks before it leave."""
-HIDDEN_FIRST = ((HELDOUT,), (HIDDEN_AUDIT,), (TRAIN,), (REFERENCE,), (EARLY_VALIDATION,), (AUDIT,))
+HIDDEN_FIRST = ((HELDOUT,), (TRAIN,), (REFERENCE,), (EARLY_VALIDATION,))
 """The same on a kernel that is reserved for hidden jobs (`agents.precedence`)."""
-HIDDEN = frozenset((HELDOUT, EARLY_VALIDATION, HIDDEN_AUDIT))
+HIDDEN = frozenset((HELDOUT, EARLY_VALIDATION))
 """Jobs with a policy's present or recorded actions on hidden cases: never on a kernel with an agent that could learn
 of them (`isolation`)."""
 
@@ -72,7 +69,7 @@ def by_priority(make: Callable[[], Any]) -> list[Any]:
     return [make() for _ in range(N_PRIORITIES)]
 
 
-GroupKind = Literal["train", "validation", "heldout", "random", "evaluation", "audit"]
+GroupKind = Literal["train", "validation", "heldout", "random", "evaluation"]
 
 
 class OutcomeDigest(NamedTuple):
@@ -230,12 +227,6 @@ class JobGroup:
     held_counted_s: float = 0.0
     """Part of the held time by which the submit's limit has been extended."""
     closed: bool = False
-    not_on: frozenset[str] = frozenset()
-    """Workers that are never leased its jobs."""
-    not_of: frozenset[str] = frozenset()
-    """Machines whose workers are never leased its jobs."""
-    numerics: str | None = None
-    """Required numerics of its workers (`Worker.numerics`); None for any."""
 
     def held(self, now: float) -> float:
         """Seconds for which none of its episodes ran because hidden jobs occupied its kernels."""
@@ -244,12 +235,6 @@ class JobGroup:
     @property
     def hidden(self) -> bool:
         return self.priority in HIDDEN
-
-    def excludes(self, worker: Worker) -> bool:
-        """Whether a worker must not play it."""
-        if worker.name in self.not_on or worker.machine in self.not_of:
-            return True
-        return self.numerics is not None and self.numerics != worker.numerics(self.flow.env)
 
     @property
     def n(self) -> int:
@@ -452,7 +437,7 @@ class Profile:
     busy: dict[Lane, None] = field(default_factory=dict)
     """Its lanes with waiting jobs."""
     workers: dict[str, None] = field(default_factory=dict)
-    """Active workers only: not paused, draining, lost or quarantined."""
+    """Active workers only: not paused, draining or lost."""
     slots: int = 0
     """Of the active workers."""
     parked: dict[str, None] = field(default_factory=dict)
@@ -605,7 +590,7 @@ class Worker:
     """Its Python installation; empty for workers of earlier versions."""
     missing_tiers: dict[str, str] = field(default_factory=dict)
     """Sandbox tiers that should work there and do not, with the reasons."""
-    state: Literal["active", "paused", "draining", "lost", "quarantined"] = "active"
+    state: Literal["active", "paused", "draining", "lost"] = "active"
     leases: dict[str, Lease] = field(default_factory=dict)
     """By id, oldest first; also given-up ones until the worker no longer names them."""
     held: list[int] = field(default_factory=partial(by_priority, int))
@@ -630,11 +615,6 @@ class Worker:
     """Environments that it should offer and that failed there, with the reasons."""
     told_size: int = 0
     """Characters of `undescribed` and `failed_environments`."""
-
-    def numerics(self, env: str) -> str:
-        """Identifies what its numbers in an environment depend on, the processor's features included: equal for workers
-        with bit-identical results."""
-        return msgspec.structs.replace(self.profile.fingerprints[env], cpu=self.cpu).class_name(cpu=True)
 
     def running(self) -> list[Lease]:
         """Leases that it plays now: as its heartbeats reported, or, before a report, the oldest, one per slot."""
@@ -669,14 +649,6 @@ class Run:
     """Held-out group id to whether each episode solved the task; empty where the environment does not report it."""
     rollout_s: float = 0.0
     queue_s: float = 0.0
-    played: dict[str, int] = field(default_factory=dict)
-    """Worker to the number of the run's episodes that it has played."""
-    audits: dict[str, AuditRow] = field(default_factory=dict)
-    """All drawn audits, by id."""
-    audits_waited_s: float = 0.0
-    """Seconds for which the run, otherwise done, has waited for playable audits."""
-    audits_checked_at: float | None = None
-    """When that was last updated; None before."""
     retries: deque[RetriedJobs] = field(default_factory=lambda: deque(maxlen=RETRIES_KEPT))
     """The last retries after infrastructure failures, for operators."""
 

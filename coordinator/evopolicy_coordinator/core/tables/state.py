@@ -3,7 +3,6 @@ the rules change it."""
 
 from __future__ import annotations
 
-from collections import deque
 from dataclasses import dataclass, field
 
 from evopolicy_common.messages.gateway import RunState
@@ -40,9 +39,6 @@ from evopolicy_coordinator.core.tables.model import (
 from evopolicy_coordinator.core.tables.related import CaseSets
 
 ATTEMPTS_PER_INCARNATION = 1_000_000
-
-DISPUTES_MAX = 50
-"""Disputes that are kept for the status."""
 
 
 @dataclass(slots=True)
@@ -86,8 +82,6 @@ class State:
         self.evaluation_keys: dict[str, str] = {}
         self.ended_evaluations: dict[str, int] = {}
         """Number of stored outcomes of each finished evaluation."""
-        self.disputes: deque[str] = deque(maxlen=DISPUTES_MAX)
-        """Disagreements between workers, in words, the latest last, since the core was loaded."""
 
         # The journal.
         self.journal: JournalRow | None = None
@@ -122,10 +116,6 @@ class State:
         """Current session to its worker."""
         self.out_of_service: dict[str, OutOfService] = {}
         """Names that an operator drained or paused; kept over restarts."""
-        self.quarantined: dict[str, str] = {}
-        """Names that an audit found to forge, with the reason, until an operator reinstates them."""
-        self.quarantined_machines: dict[str, str] = {}
-        """Machines of those names, to the name."""
         self.n_live = 0
         """Live leases in all."""
         self.freed: dict[str, None] = {}

@@ -21,7 +21,7 @@ from evopolicy_common.messages.worker import JobResult, Message
 from evopolicy_coordinator.core.contract.effects import Effect, Log, Persist, Refuse, Reply
 from evopolicy_coordinator.core.contract.events import RequestId
 from evopolicy_coordinator.core.contract.reasons import Reason
-from evopolicy_coordinator.core.contract.records import AuditRow, Row, SubmitRow
+from evopolicy_coordinator.core.contract.records import Row, SubmitRow
 from evopolicy_coordinator.core.tables import transitions
 from evopolicy_coordinator.core.tables.model import Flow, JobGroup, JobState, Lane, Profile, Run, Worker
 
@@ -97,12 +97,6 @@ class SubmitEnded(NamedTuple):
     row: SubmitRow
 
 
-class AuditsMoved(NamedTuple):
-    """An audit of a run ended or advanced: the run may have waited for it."""
-
-    run: Run
-
-
 class AgentOverdue(NamedTuple):
     """A run's agent has kept hidden jobs of closed runs from their kernels for too long."""
 
@@ -117,7 +111,6 @@ News = (
     | ResultsDiffered
     | FlowPinned
     | SubmitEnded
-    | AuditsMoved
     | AgentOverdue
 )
 
@@ -199,14 +192,5 @@ class Step:
         if row.status != before.status:
             key = f"{run.id}/s{index}"
             transitions.check(transitions.SUBMIT, key, before.status or "open", row.status or "open")
-        self.persist(row)
-        return row
-
-    def put_audit(self, run: Run, row: AuditRow) -> AuditRow:
-        """Store a new or changed audit; raises InvariantError when the new state may not follow the old one."""
-        before = run.audits.get(row.audit)
-        if before is not None and row.state != before.state:
-            transitions.check(transitions.AUDIT, row.audit, before.state, row.state)
-        run.audits[row.audit] = row
         self.persist(row)
         return row

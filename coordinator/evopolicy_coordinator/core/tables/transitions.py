@@ -1,4 +1,4 @@
-"""Allowed transitions as data: phases of a run, verdicts of a submit, places of a job, states of an audit.
+"""Allowed transitions as data: phases of a run, verdicts of a submit, places of a job.
 
 Every change of one of these goes through `check`.
 """
@@ -22,13 +22,6 @@ RUN: Table = {
 
 SUBMIT: Table = {"open": get_args(SubmitStatus), **dict.fromkeys(get_args(SubmitStatus), ())}
 """An open submit gets any verdict, once; `open` is a status of None."""
-
-AUDIT: Table = {
-    "open": ("agreed", "disputed", "not_audited"),
-    "agreed": (),
-    "disputed": (),
-    "not_audited": (),
-}
 
 Place = Literal["new", "queued", "leased", "parting", "backing_off", "adopting", "closed"]
 

@@ -6,10 +6,7 @@ Rules that this module owns:
 - A lost liveliness token is a hint: it only brings the worker's deadline forward.
 - A worker name stays bound to its machine while the worker is connected.
 - A token lets a limited number of workers join, with a limited size of descriptions.
-- Every request of a quarantined worker is refused with the reason; other workers play its jobs, and its later reports
-  are not accepted. An operator may reinstate it.
-- Draining, pausing and quarantine outlive restarts. An operator's change of a run's fingerprint class is recorded in
-  the run.
+- Draining and pausing outlive restarts. An operator's change of a run's fingerprint class is recorded in the run.
 """
 
 from __future__ import annotations
@@ -30,7 +27,6 @@ from evopolicy_coordinator.core.workers import scheduler
 def registered(state: State, event: events.WorkerRegistered, step: Step) -> None:
     """A worker joins, or joins again under a new session."""
     message = event.message
-    _refuse_forger(state, message.worker, event.machine)
     old = state.workers.get(message.worker)
     if old is not None and old.state != "lost" and old.machine != event.machine:
         # Otherwise one machine could play under another's name, and the other would be blamed.
@@ -59,20 +55,12 @@ def registered(state: State, event: events.WorkerRegistered, step: Step) -> None
     pins.pin_waiting(state, worker, step)
 
 
-def _refuse_forger(state: State, name: str, machine: str) -> None:
-    forger = name if name in state.quarantined else state.quarantined_machines.get(machine)
-    if forger is not None:
-        raise NotDoneError("forger", worker=name, why=state.quarantined[forger], forger=forger)
-
-
 def worker_of(
     state: State, event: events.Requested[wire.LeaseRequest | wire.Heartbeat | wire.ReportResults], step: Step
 ) -> Worker:
-    """Returns the worker that sent the request. Raises NotDoneError when its session is unknown or it is
-    quarantined."""
+    """Returns the worker that sent the request. Raises NotDoneError when its session is unknown."""
     message = event.message
     known = state.workers.get(message.worker)
-    _refuse_forger(state, message.worker, known.machine if known else "")
     was_lost = known is not None and known.state == "lost"
     worker = fleet.of_session(state, message.worker, message.session, step.now)
     if worker is None:
@@ -120,8 +108,6 @@ def liveness_lost(state: State, event: events.LivenessLost, step: Step) -> None:
 def worker_state(state: State, event: events.Requested[operator.SetWorker], step: Step) -> None:
     """Drain, pause or reactivate a worker; durable, also for one that is not connected."""
     message = event.message
-    if message.state != "active" and message.worker in state.quarantined:
-        raise NotDoneError("quarantined", worker=message.worker, why=state.quarantined[message.worker])
     step.persist(WorkerRow(worker=message.worker, state=message.state))
     worker = state.workers.get(message.worker)
     if worker is not None and message.state != "active":

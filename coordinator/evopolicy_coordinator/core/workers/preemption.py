@@ -1,8 +1,8 @@
 """Makes room: stops hidden jobs for train jobs that wait, and empties a worker for a suspect.
 
 Rules that this module owns:
-- A waiting train job stops hidden jobs; a suspect stops those of the worker that is emptied for it. Audits and
-  early validation are stopped without limit, others a bounded number of times. The hidden job goes back into the
+- A waiting train job stops hidden jobs; a suspect stops those of the worker that is emptied for it. Early
+  validation is stopped without limit, others a bounded number of times. The hidden job goes back into the
   queue; its worker releases it and polls again.
 - A suspect is a job that may crash workers. It runs alone, on an idle worker or on one that is emptied for it;
   that worker gets no other job in the meantime.
@@ -16,10 +16,8 @@ from evopolicy_common.messages import worker as wire
 from evopolicy_coordinator.core.isolation import conflicts
 from evopolicy_coordinator.core.leasing import fleet, leases, queue
 from evopolicy_coordinator.core.tables.model import (
-    AUDIT,
     EARLY_VALIDATION,
     HELDOUT,
-    HIDDEN_AUDIT,
     REFERENCE,
     TRAIN,
     CaseSet,
@@ -54,7 +52,7 @@ def preempt(state: State, lane: Lane, step: Step) -> None:
     avoided = queue.avoided(lane, TRAIN, step.now)
     for case_set in list(islice(lane.waiting[TRAIN], CASE_SETS_MAX)):
         wanted -= clear(state, lane, case_set, avoided, step)
-    for priority in (HIDDEN_AUDIT, AUDIT, EARLY_VALIDATION, HELDOUT, REFERENCE):
+    for priority in (EARLY_VALIDATION, HELDOUT, REFERENCE):
         for profile in lane.profiles:
             hidden = profile.hidden[priority]
             for lease in list(islice(reversed(hidden), VICTIMS_MAX)):
@@ -135,7 +133,7 @@ def next_suspect(state: State, worker: Worker, step: Step) -> wire.Lease | None:
             continue
         if job.priority >= EARLY_VALIDATION and (lane.n_ready[TRAIN] or not idle):
             continue
-        if job.group.excludes(worker) or _barred(state, job, worker):
+        if _barred(state, job, worker):
             continue
         if idle:
             return _alone(state, job, worker, step)

@@ -9,7 +9,7 @@ Rules that this module owns:
 - The actions that the policy of a given-back attempt had returned stand: no later attempt gives the policy a second
   try. If a worker that was silent for long reports that a limit ended the attempt, its actions do not stand.
 - An attempt that was granted to another worker, or never granted, is ignored and logged, also after a restart: a
-  lease's name proves its grant. So is an attempt of a worker that the job's group excludes.
+  lease's name proves its grant.
 - An outcome that does not fit the job (wrong episodes, a number that is not finite, or beyond 1e100) or a page for its
   gateway is the worker's failure.
 - The time that an episode took counts for the fair share only up to the time for which its worker had the lease.
@@ -51,9 +51,6 @@ def take(state: State, news: ResultsPersisted, step: Step) -> None:
     if job is None or not granted:
         _closed(state, worker, lease, result, step, granted=granted)
         return
-    if job.group.excludes(worker):
-        step.log("warning", "result_of_foreign_lease", worker=worker.name, lease=result.lease_id)
-        return
     live = lease is not None and lease.live and job.lease is lease
     counts = live or (lease is not None and lease.parting)
     silent = lease is None or _silent(state, lease, step.now)
@@ -81,7 +78,7 @@ def _environment_fault(state: State, worker: Worker, job: JobState, error: str, 
     faults.since = faults.since or step.now
     faults.on.add(worker.machine or worker.name)
     names = [name for profile in lane.profiles for name in profile.workers] if lane is not None else []
-    able = [each for each in map(state.workers.__getitem__, names) if not job.group.excludes(each)]
+    able = map(state.workers.__getitem__, names)
     if retry.in_vain(state.settings, faults, {each.machine or each.name for each in able}, step.now):
         step.tell(EnvironmentFailed(job.group, f"{error}; {faults.n} attempts at {job.job_id} ended so"))
 
@@ -229,9 +226,8 @@ def _commit(
         if outcome.success is not None:
             group.solved[outcome.index] = outcome.success
         step.persist(row)
-        if group.kind != "audit" and leased_s is not None:
+        if leased_s is not None:
             # The fair share counts in this time, so a worker must not be able to make it up.
             group.flow.observe(min(outcome.wall_s, max(leased_s, 1.0)))
-    if group.kind != "audit":
-        state.rate.count(len(result.episodes), step.now)
+    state.rate.count(len(result.episodes), step.now)
     step.tell(EpisodesDone(group, worker, result.episodes))

@@ -33,7 +33,7 @@ from evopolicy_coordinator.storage.disk_use import sizes
 
 CONTENT_TYPE = "text/plain; version=0.0.4; charset=utf-8"
 _SECONDS = (0.1, 0.3, 1, 3, 10, 30, 60, 180, 600, 1800, 3600, 4 * 3600, 24 * 3600)
-_STATES = ("active", "paused", "draining", "lost", "quarantined")
+_STATES = ("active", "paused", "draining", "lost")
 _PHASES = ("open", "validation", "heldout", "random", "finished")
 
 
@@ -155,10 +155,6 @@ class StatusCollector(Collector):
         yield _gauge("evopolicy_runs_waiting", "Runs that wait for something.", waiting)
         text = "Jobs and groups that wait longer than they should."
         yield _gauge("evopolicy_stalls", text, len(status.stalls))
-        text = "Workers that audits have put into quarantine."
-        yield _gauge("evopolicy_quarantined_workers", text, len(status.quarantined))
-        audits = {(state,): n for state, n in sorted(status.audits.items())}
-        yield _gauges("evopolicy_audits", "Audited episodes of unfinished runs.", ("state",), audits)
 
 
 class _StoreCollector(Collector):

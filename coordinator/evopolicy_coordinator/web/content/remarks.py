@@ -15,10 +15,6 @@ def remarks(reply: StatusReply) -> Mapping[str, Iterable[str]]:
         f"{one.worker}{one.host and f' of {one.host}'} was turned away {duration(one.ago_s)} ago: {one.why}"
         for one in reply.turned_away
     )
-    quarantined = (
-        f"{name} is quarantined: {why} (evopolicy workers resume {name} takes it back)"
-        for name, why in reply.quarantined.items()
-    )
     refused = (
         f"{one.worker} gets no work of {run}: {why}" for one in workers for run, why in one.refused.items()
     )
@@ -28,9 +24,7 @@ def remarks(reply: StatusReply) -> Mapping[str, Iterable[str]]:
     trouble = [f"{reply.trouble}; what follows is the last state"] if reply.trouble else []
     return {
         "The coordinator accepts no changes": trouble,
-        "Quarantined workers": quarantined,
         "Turned away": turned_away,
-        "Disputes of audits": reply.disputes,
         "Abandoned runs, without a gateway for an hour": abandoned(reply.runs),
         "Workers that get no work of some runs": refused,
         "Workers that lack a sandbox tier or an environment": (
@@ -57,11 +51,3 @@ def lacks(worker: WorkerStatus) -> Iterator[str]:
         yield f"{worker.worker} has no sandbox tier {tier}: {why}"
     for env, why in worker.failed_environments.items():
         yield f"{worker.worker} does not offer {env}: {why}"
-
-
-def audits(reply: StatusReply) -> str:
-    """The share of audited episodes and their states; empty without audits."""
-    if not (reply.audit_share or reply.audits):
-        return ""
-    states = ", ".join(f"{n} {state.replace('_', ' ')}" for state, n in sorted(reply.audits.items()))
-    return f"{reply.audit_share:g} of the episodes of new runs; now {states or 'none'}"

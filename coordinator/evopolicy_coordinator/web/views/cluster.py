@@ -16,7 +16,7 @@ from evopolicy_common.messages.status import DiskUse, StatusReply, WorkerStatus
 from evopolicy_common.terminal import duration
 from evopolicy_coordinator.web.content.charts import Line, chart
 from evopolicy_coordinator.web.content.cluster import Cluster
-from evopolicy_coordinator.web.content.remarks import audits, remarks
+from evopolicy_coordinator.web.content.remarks import remarks
 from evopolicy_coordinator.web.content.rendering import PAGE_ROWS, View, Words, ident, paged, part, short
 from evopolicy_coordinator.web.content.run_folders import RunFacts, Runs
 from evopolicy_results.html import notice
@@ -92,7 +92,7 @@ def _cluster_notices(cluster: Cluster, status: StatusReply) -> list[dict[str, An
         if texts := [line for line in lines if line]:
             more = [f"… and {len(texts) - _NOTICE_LINES} more"] if len(texts) > _NOTICE_LINES else []
             notices.append(notice(title, texts[:_NOTICE_LINES] + more))
-    return [*notices, *([notice(f"Audits: {shown}.")] if (shown := audits(status)) else [])]
+    return notices
 
 
 def _disks(of_coordinator: DiskUse | None, roots: Sequence[Path]) -> list[dict[str, Any]]:

@@ -199,20 +199,17 @@ async def started(state: Path | None, env_ids: Sequence[str], slots: int, **more
         await cluster.start_workers(env_ids, slots=slots)
 
 
-async def test_workers_divide_the_slots_of_an_audited_cluster(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+async def test_a_local_cluster_passes_its_options_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     noted_by = noted(monkeypatch)
     monkeypatch.chdir(tmp_path)
     more = {"browser": Path("/opt/chrome"), "env_timeout": 2.5, "env_memory": 512}
-    given = {"data": Path("d"), "audit": 0.5, "policy_packages": ["scipy"], **more}
+    given = {"data": Path("d"), "policy_packages": ["scipy"], **more}
     await started(None, ["toy/line", "toy/maze"], 5, **given)
-    expected = f"--trust-workers --data {tmp_path}/d --audit 0.5 --policy-package scipy"
+    expected = f"--trust-workers --data {tmp_path}/d --policy-package scipy"
     assert " ".join(noted_by["test-coordinator"]).endswith(expected)
     own = " ".join(noted_by["test-worker"])
     assert "--policy-package scipy --browser /opt/chrome --env-timeout 2.5 --env-memory 512" in own
-    assert own.endswith("--env toy/line --env toy/maze --slots 3")
-    assert noted_by["test-worker-2"][-2:] == ["--slots", "2"]
+    assert own.endswith("--env toy/line --env toy/maze --slots 5")
 
 
 async def test_each_virtual_environments_worker_has_all_slots(

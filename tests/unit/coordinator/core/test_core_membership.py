@@ -1,8 +1,9 @@
-"""One token lets only so many workers join, with descriptions of a bounded size.
+"""Who may join: a bounded number of workers a token, each under a name of its machine.
 
 Attacks, each with its defence:
 - registers ever more worker names, or large descriptions under each: 4,096 workers and 256 MiB of
   descriptions for one token.
+- uses another machine's worker name to have it blamed: a name stays bound to its machine while the worker is connected.
 """
 
 from __future__ import annotations
@@ -61,3 +62,12 @@ def test_descriptions_of_a_token_have_a_bounded_size(monkeypatch: pytest.MonkeyP
     assert joins(rig, "w3", version="3", size=40), "but in the place of one that does not"
     assert not joins(rig, "w5", version="3", undescribed=("toy/another-one-of-many",) * 5)
     assert not joins(rig, "w5", version="3", failed_environments={"my/x": "why" * 50})
+
+
+def test_a_machine_cannot_play_under_the_name_of_anothers_worker() -> None:
+    """It would have the other machine blamed for what it reports."""
+    rig = Rig()
+    assert isinstance(join(rig, "w1", machine="good"), wire.Registered)
+    refused = join(rig, "w1", machine="bad")
+    assert (refused.status, "another machine" in refused.message) == ("name_taken", True)
+    assert isinstance(join(rig, "w1", machine="good"), wire.Registered)

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import pytest
-from rigs.audit_fleet import WAIT_S as AUDIT_WAIT_S
-from rigs.audit_fleet import Fleet
 from rigs.core_rig import BUNDLE, Rig, split_of
 
 from evopolicy_common.messages import gateway, operator
@@ -281,37 +279,6 @@ def test_a_closed_runs_hidden_cases_precede_others_train_jobs(rig: Rig) -> None:
     rig.submit(0, 1, run="r2")
     rig.close("r1")
     assert splits(rig.poll(session, 1)) == ["validation"]
-
-
-def test_the_audits_clock_stands_still_while_their_kernels_are_barred() -> None:
-    fleet = Fleet(w1=0.0, w2=0.0)
-    fleet.rig.settings = fleet.rig.core.state.settings = type(fleet.rig.settings)(
-        audit_share=1.0, audit_wait_s=AUDIT_WAIT_S, hidden_wait_s=1e9
-    )
-    rig = fleet.rig
-    fleet.train(0, run="r0")
-    while fleet.turn("w1"):
-        pass
-    rig.close("r0")
-    while fleet.turn("w1"):
-        pass
-    for number, name in enumerate(fleet.sessions):
-        rig.create(f"a{number}", agent=f"kernel-of-{name}")
-    fleet.work_off()
-    _beat_all(rig, fleet.sessions, 3 * AUDIT_WAIT_S)
-    assert "r0" in rig.core.state.runs
-    for number in range(2):
-        rig.close(f"a{number}")
-    _beat_all(rig, fleet.sessions, AUDIT_WAIT_S + 10.0)  # nobody plays them
-    assert "r0" not in rig.core.state.runs
-    assert rig.finished("r0").audit is not None
-
-
-def _beat_all(rig: Rig, sessions: dict[str, str], seconds: float) -> None:
-    for _ in range(int(seconds / 2.0)):
-        rig.pass_time(2.0)
-        for session in sessions.values():
-            rig.beat(session)
 
 
 def test_one_host_one_slot_and_four_runs_come_to_an_end() -> None:

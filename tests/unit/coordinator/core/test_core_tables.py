@@ -14,7 +14,7 @@ from evopolicy_coordinator.core.structures import InvariantError
 from evopolicy_coordinator.core.structures.polls import PollKind
 from evopolicy_coordinator.core.tables import step
 from evopolicy_coordinator.core.tables.model import GroupKind
-from evopolicy_coordinator.core.tables.transitions import AUDIT, JOB, RUN, SUBMIT, Table, check
+from evopolicy_coordinator.core.tables.transitions import JOB, RUN, SUBMIT, Table, check
 
 CORE = Path(evopolicy_coordinator.core.__file__).parent
 
@@ -52,7 +52,7 @@ def test_each_kind_of_long_poll_is_answered_in_time() -> None:
     assert set(POLLS) == set(get_args(PollKind))
 
 
-@pytest.mark.parametrize("table", [RUN, SUBMIT, AUDIT, JOB])
+@pytest.mark.parametrize("table", [RUN, SUBMIT, JOB])
 def test_a_table_of_transitions_is_closed_and_ends(table: Table) -> None:
     assert {after for states in table.values() for after in states} <= set(table)
     assert not all(table.values())

@@ -55,7 +55,7 @@ def test_a_reason_about_another_is_put_into_one_sentence() -> None:
         env="gym/x",
         tier="bwrap",
         same_versions=True,
-        away=("lost", "quarantined"),
+        away=("lost", "paused"),
         connected=True,
         lacking=(),
         failed=(),
@@ -63,7 +63,7 @@ def test_a_reason_about_another_is_put_into_one_sentence() -> None:
     assert (
         words(because("no_worker_yet", waits_for=missing))
         == "the run waits for a worker that offers gym/x with sandbox tier bwrap, of the versions that the run started"
-        " with: those that do are lost or out of service"
+        " with: those that do are lost or paused"
     )
 
 

@@ -292,7 +292,6 @@ def test_what_agents_wrote_is_text_on_every_page(tmp_path: Path) -> None:
         open_status("r-open", entry=MARKUP, waits_for=MARKUP, exp_id=MARKUP),
         workers=(worker,),
         stalls=(MARKUP,),
-        quarantined={MARKUP: MARKUP},
     )
     with client(site_of(tmp_path, cluster=reply)) as operator:
         for path in (*PAGES, "/cluster", "/?q=" + "%3Cscript%3E"):

@@ -136,7 +136,6 @@ def test_a_script_is_told_of_a_run_by_the_same_names(tmp_path: Path) -> None:
             "budget_used": 8,
             "closed_reason": "budget_spent",
             "wall_s": 12.5,
-            "in_question": False,
             "wrong_option": False,
         }
     ]
