@@ -17,10 +17,9 @@
 # make bench-throughput   episodes per second through the coordinator
 # make bench-scale        CPU of coordinator, gateways and workers' supervisors an episode, with real trajectories
 # make bench-channels     what a policy can tell others on its machine, at once and afterwards; --gaps N: what time tells it of its split
-# make bench-report bench-coverage       a report over 1,024 runs
+# make bench-coverage     how often a report's intervals cover
 # make bench-isolation    a sweep with hidden episodes kept from agents' machines, and without
 # make bench-costs        processor time, hours and disk of runs without a model's bill
-# make bench-web bench-web-live       the live view: 2,000 workers, 500 open runs, 200 browsers
 # make faults real processes killed, frozen and starved through whole runs; ARGS="--chaos 3600": several at once, at random
 # make sim    the coordinator's core under a simulated network with faults
 PYTHON ?= $(shell for p in python3.13 python3.12 python3.11 python3; do \
@@ -35,7 +34,7 @@ FAMILIES := $(VENV)/.families
 STAMP := $(VENV)/.installed
 
 .DEFAULT_GOAL := help
-.PHONY: help install families paper-worker demo test test-root test-system test-families test-long check check-envs docs release bench bench-start bench-replay bench-peers bench-throughput bench-scale bench-channels bench-report bench-coverage bench-isolation bench-costs bench-web bench-web-live faults sim clean
+.PHONY: help install families paper-worker demo test test-root test-system test-families test-long check check-envs docs release bench bench-start bench-replay bench-peers bench-throughput bench-scale bench-channels bench-coverage bench-isolation bench-costs faults sim clean
 
 help:
 	@sed -n 's/^# make/make/p' Makefile
@@ -147,10 +146,6 @@ bench-scale: install
 bench-channels: install
 	@PYTHONPATH=tests/support $(BIN)/python tests/bench/channel_bench.py $(ARGS)
 
-# How long a report over 1,024 runs takes, and its memory.
-bench-report: install
-	@PYTHONPATH=tests/support $(BIN)/python tests/bench/report_scale.py $(ARGS)
-
 # How often a report's intervals cover, on simulated entries. Quicker: ARGS=300
 bench-coverage: install
 	@PYTHONPATH=tests/support $(BIN)/python tests/bench/coverage.py $(ARGS)
@@ -162,14 +157,6 @@ bench-isolation: install
 # What whole runs cost on this machine, as docs/explanation/costs.md has it. Quicker: ARGS="--budget 16 --only random llm"
 bench-costs: install
 	@PYTHONPATH=tests/support $(BIN)/python tests/bench/run_costs.py $(ARGS)
-
-# The live view at scale: what pages weigh, what browsers are sent, and what the coordinator spends on it.
-bench-web: install
-	@$(BIN)/python tests/bench/web_bench.py $(ARGS)
-
-# The same cost at a real coordinator: CPU time of its process without a view, with one, and with two.
-bench-web-live: install
-	@PYTHONPATH=tests/support $(BIN)/python tests/bench/web_live.py $(ARGS)
 
 # Real processes killed, frozen and starved: what is hit × when → outcome. More instants: ARGS="--fault-seeds 4"
 faults: install
