@@ -114,7 +114,8 @@ def open_run(
     }
     (episode / "trajectory.jsonl").write_text(json.dumps(row) + "\n" + json.dumps({**row, "t": 1}) + "\n")
     summary = {
-        "schema_version": "0.1", "submit_index": 0, "env": env, "status": "ok", "n_episodes": 1, "first_global_episode": 0,
+        "schema_version": "0.1", "submit_index": 0, "env": env, "status": "ok", "n_episodes": 1,
+        "first_global_episode": 0,
         "env_instances": [7], "remaining_budget": 127, "submit_started_at": "2026-01-01T00:00:00.000000Z",
         "submit_completed_at": "2026-01-01T00:00:01.000000Z", "wall_time_seconds": 1.0, "returns": [-2.0],
         "mean_return": -2.0, "std_return": 0.0, "min_return": -2.0, "max_return": -2.0, "episode_lengths": [2],
