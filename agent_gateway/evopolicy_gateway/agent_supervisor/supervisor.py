@@ -84,6 +84,7 @@ async def keep(order: StartAgent, orders: Orders) -> AgentEnded:
         clock=clock,
         activity=activity,
         prompts=msgspec.convert(order.prompts, Prompts),
+        tells_left=order.tells_left,
         joins=resources.joins,
     )
     play = asyncio.create_task(_play(order, stage, config, resources))

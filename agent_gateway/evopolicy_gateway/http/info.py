@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from typing import Any
 
 import msgspec
@@ -16,8 +17,8 @@ _COUNTS = ("episode_budget", "min_episodes_per_submit", "max_episodes_per_submit
 _SETTINGS = ("policy_scope", "finish", "feedback", "observations", "sandbox_tier", "video")
 
 
-def info_document(machine: TicketMachine) -> dict[str, Any]:
-    """Everything that an agent may know of the run, as plain values."""
+def info_document(machine: TicketMachine, left: Mapping[str, Any] | None = None) -> dict[str, Any]:
+    """Everything that an agent may know of the run, as plain values. `left`: of the agent's own limits."""
     run, state = machine.run, machine.state
     env = run.env
     env_meta = {name: getattr(env, name) for name in ("env", "env_version")}
@@ -43,6 +44,7 @@ def info_document(machine: TicketMachine) -> dict[str, Any]:
         "end_grace_s": LAST_WORDS_S,
         "last_warning": machine.last_warning,
         "submit_in_flight": machine.in_flight and progress_document(machine.in_flight, state),
+        **({} if left is None else {"left": left}),
     }
 
 

@@ -17,6 +17,7 @@ import html
 from http.server import BaseHTTPRequestHandler
 from typing import Any
 
+import msgspec
 import orjson
 from starlette.applications import Starlette
 from starlette.exceptions import HTTPException
@@ -54,7 +55,10 @@ def make_app(pipeline: SubmitPipeline, token: str, bearer: str = "") -> ASGIApp:
 
     async def info(request: Request) -> Response:
         await pipeline.refresh()
-        return _json(200, info_document(machine))
+        left = None
+        with contextlib.suppress(OSError, msgspec.DecodeError):
+            left = msgspec.json.decode(pipeline.folder.left.read_bytes(), type=dict[str, int])
+        return _json(200, info_document(machine, left))
 
     async def task_text(request: Request) -> Response:
         return Response(task, media_type="text/markdown; charset=utf-8")

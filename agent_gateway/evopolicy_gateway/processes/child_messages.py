@@ -165,6 +165,8 @@ class StartAgent(Order, frozen=True, kw_only=True, tag="start_agent"):
     started_in: str
     """The operator's working directory; relative file names in the agent's command start there."""
     wall_limit_s: float
+    tells_left: bool = False
+    """Whether prompts say how much of the agent's time and tokens is left."""
     prompts: dict[str, str] = {}
     """Texts in place of the standard ones: `Prompts`."""
     config: dict[str, Any] | None = None

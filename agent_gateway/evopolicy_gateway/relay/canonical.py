@@ -49,6 +49,12 @@ TEXTS: tuple[tuple[str, re.Pattern[bytes], bytes], ...] = (
         re.compile(rb"(-r--r--r-- 1 \S+ +\S+ )[ \d]+(?= \[time\] \S*summary\.json)"),
         rb"\1[size]",
     ),
+    (
+        "what is left of an agent's time and tokens",
+        re.compile(rb"(Left: )[\d hmin]+ of time, [\d,]+"),
+        rb"\1[left]",
+    ),
+    ("what is left of an agent's time and tokens", re.compile(rb'(left\\*":\s*)\{[^{}]*\}'), rb"\1[left]"),
     ("durations of a submit", re.compile(rb'(wall_time_seconds\\*":\s*)[0-9.eE+-]+'), rb"\1[seconds]"),
     ("what Codex tells of a command", re.compile(rb"(Wall time: )[0-9a-f.]+"), rb"\1[once]"),
     ("what Codex tells of a command", re.compile(rb"(Chunk ID: )[0-9a-f.]+"), rb"\1[once]"),

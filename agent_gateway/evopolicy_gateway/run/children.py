@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import sys
 import time
 from collections.abc import Awaitable, Callable
@@ -12,12 +13,14 @@ import msgspec
 
 from evopolicy_common.errors import EvopolicyError
 from evopolicy_common.processes import child_process, host
+from evopolicy_common.records.blobs import write_atomically
 from evopolicy_common.records.run_record import AgentLimits
 from evopolicy_common.wire import credentials
 from evopolicy_common.wire.credentials import Credentials
 from evopolicy_gateway.jail.jail import JailOrder
 from evopolicy_gateway.processes import child_messages as messages
 from evopolicy_gateway.processes.child_messages import AgentEnded, Child, Progress, Ready, RelayAddress
+from evopolicy_gateway.relay import ledger
 from evopolicy_gateway.run.operations import Operations
 from evopolicy_gateway.run.plan import Plan
 from evopolicy_gateway.run.times import Stopwatch
@@ -160,6 +163,7 @@ class SupervisedAgent(Kept):
 
     def __init__(self, run: OpenRun) -> None:
         super().__init__(run)
+        self._terms = run.plan.harness().model
         self.survivors: list[int] = []
         """Process ids of the agent that survive being killed."""
         self._submits = messages.SubmitsSeen(asked=0, running=False)
@@ -216,6 +220,8 @@ class SupervisedAgent(Kept):
                 case messages.AgentUsed():
                     resources = event.resources if plan.listener is None else None
                     run.stopwatch.reported("agent", agent_s=event.used_s, resources=resources)
+                    if plan.settings.profile == "own":
+                        self._keep_left()
                 case messages.AgentSurvives():
                     self.survivors = list(event.pids)
                     self.tell_survivors()
@@ -230,6 +236,16 @@ class SupervisedAgent(Kept):
             await asyncio.sleep(_SURVIVORS_PAUSE_S)
         self.survivors = []
         return ended
+
+    def _keep_left(self) -> None:
+        """Writes what `/info` tells of the agent's limits. A full disk keeps the earlier values."""
+        run, terms = self._run, self._terms
+        left = {"wall_time_s": round(max(0.0, run.plan.wall_limit_s - run.stopwatch.times.agent_s))}
+        if terms is not None and run.folder.model_requests.exists():
+            used = ledger.read(run.folder.model_requests).usage.total
+            left["model_tokens"] = max(0, terms.limits.max_tokens - used)
+        with contextlib.suppress(OSError):
+            write_atomically(run.folder.left, msgspec.json.encode(left))
 
     def _start_order(self, ready: Ready, relay: RelayAddress | None) -> messages.StartAgent:
         plan, folder, config = self._run.plan, self._run.folder, self._run.plan.known_config
@@ -251,6 +267,7 @@ class SupervisedAgent(Kept):
             started_in=str(plan.started_in),
             wall_limit_s=max(1.0, plan.wall_limit_s - self._run.stopwatch.times.agent_s),
             silence_s=plan.silence_s,
+            tells_left=plan.settings.profile == "own",
             prompts=msgspec.to_builtins(plan.texts.prompts),
             inputs=plan.texts.inputs,
             config=None if config is None else msgspec.to_builtins(config),

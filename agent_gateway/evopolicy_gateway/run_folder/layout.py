@@ -125,6 +125,8 @@ class RunFolder(msgspec.Struct, frozen=True):
     """A coding agent's session: `SessionState`."""
     times = Place(f"{open_run.STATE}/times.json")
     """Time spent on its train side so far: `Times`."""
+    left = Place(f"{open_run.STATE}/left.json")
+    """How much of its time and its model's tokens the agent has left, for `/info`; none with a published profile."""
     agent = Place(f"{open_run.STATE}/agent")
     """A jailed agent's files outside its workspace: home and /tmp."""
     start = Place(f"{open_run.STATE}/start.json")

@@ -54,7 +54,7 @@ class SubmitPipeline:
         self.fatal: asyncio.Future[None] = asyncio.get_running_loop().create_future()
         """Fails with the error that ends this process."""
         self._client = client
-        self._folder = folder
+        self.folder = folder
         self._journal = journal
         self._blobs = BlobStore(folder.blobs)
         self._on_change = on_change
@@ -154,10 +154,10 @@ class SubmitPipeline:
         try:
             match effect:
                 case "snapshot":
-                    given = self._folder.system, self._blobs
+                    given = self.folder.system, self._blobs
                     published = machine.run.profile != "own"
                     snapshot = await self._on_disk(partial(snapshots.take, *given, published=published))
-                    more = (ticket.submit_id, self._trees, self._blobs, self._folder.root)
+                    more = (ticket.submit_id, self._trees, self._blobs, self.folder.root)
                     return machine.snapshotted(
                         await asyncio.to_thread(snapshots.record_tree, snapshot, *more)
                     )
@@ -215,7 +215,7 @@ class SubmitPipeline:
     async def _collect(self, ticket: Ticket) -> tuple[SubmitDone, bytes]:
         """Writes the feedback; starts over when the disk refuses."""
         assert ticket.accepted is not None
-        tree = SubmitTree(self._folder.feedback, ticket.submit_id)
+        tree = SubmitTree(self.folder.feedback, ticket.submit_id)
         known = (ticket, ticket.accepted, self._client, tree, self._journal.at_work, self._changed)
         while True:
             try:

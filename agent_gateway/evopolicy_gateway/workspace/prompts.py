@@ -78,6 +78,12 @@ def warned(warning: str | None) -> str:
     return f" In your last submit {warning}" if warning else ""
 
 
+def left(wall_s: float, n_tokens: int) -> str:
+    """Addition to a prompt that says how much is left of the agent's limits."""
+    minutes = max(0, round(wall_s / 60.0))
+    return f" Left: {minutes // 60} h {minutes % 60:02} min of time, {n_tokens:,} tokens of the model."
+
+
 def read_prompts(path: Path) -> Prompts:
     """The prompts in a TOML file. Raises ConfigError that names the file and the fault."""
     try:

@@ -99,6 +99,7 @@ assert answer["summary"]["env_instances"] == [1022, 1023, 0] and answer["is_fina
 assert ask("/finalize", {})[0] == 405
 spend_all()
 assert ask("/info")[1]["state"] | {"n_submits": 0} == {"remaining_budget": 0, "n_submits": 0, "is_finalized": True}
+assert "left" not in ask("/info")[1]
 code, answer = submit([0])
 assert (code, answer["status"]) == (409, "run_closed")
 time.sleep(1000)  # and it is ended, after a time that AGENTS.md tells

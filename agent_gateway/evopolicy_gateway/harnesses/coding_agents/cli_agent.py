@@ -35,6 +35,7 @@ from evopolicy_gateway.inputs.kept import Kept
 from evopolicy_gateway.processes.child_messages import AgentDoing, AgentEnded, RelayAddress
 from evopolicy_gateway.relay.limits import ModelTerms
 from evopolicy_gateway.relay.usage import Usage
+from evopolicy_gateway.workspace import prompts
 
 _PROBE_TIMEOUT_S = 60.0
 _MAX_PAUSE_S = 3600.0
@@ -115,6 +116,9 @@ class CliAgent(Harness):
 
     async def _turn(self, stage: Stage, prompt: str) -> TurnReader:
         dialect, state = self._dialect, self._state
+        if stage.tells_left:
+            n_tokens = max(0, self._config.limits.max_tokens - state.usage.total)
+            prompt += prompts.left(stage.clock.remaining_s(), n_tokens)
         resume = state.session is not None and dialect.resumes
         begun = state.session if resume else str(uuid.uuid4()) if dialect.makes_session_id else None
         stage.log.note({"type": "prompt", "turn": state.turns, "session": begun, "message": prompt})

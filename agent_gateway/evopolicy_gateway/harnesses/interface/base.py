@@ -59,6 +59,8 @@ class Stage(msgspec.Struct, frozen=True, kw_only=True):
     over: asyncio.Event = msgspec.field(default_factory=asyncio.Event)
     """Set when the agent's time is up: programs that end after that were ended, and are not restarted."""
     prompts: Prompts = Prompts()
+    tells_left: bool = False
+    """Whether prompts say how much of the agent's time and tokens is left."""
     jail: Jail | None = None
     """The jail of every program that `start` starts."""
     joins: Sequence[str] = ()

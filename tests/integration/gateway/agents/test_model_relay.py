@@ -148,6 +148,24 @@ def test_a_model_that_cannot_play_ends_the_run_with_the_reason(
         assert '"name": "edit_file", "input": {"path": "policy.py"}' in log
 
 
+def test_an_agent_is_told_what_is_left_of_its_time_and_tokens(tmp_path: Path, operator: Path) -> None:
+    wait = (
+        "for n in $(seq 200); do curl -s --noproxy '*' $EVOPOLICYGYM_INFO_URL > info;"
+        " grep -q model_tokens info && break; sleep 0.1; done; cat info"
+    )
+    _, api, _ = played(tmp_path, operator, [Step(command=wait), *ENDS], max_tokens=10**6)
+    prompt = api.requests[0]["messages"][1]["content"]
+    assert re.search(
+        r" Left: 11 h 59 min of time, 1,000,000 tokens|Left: 12 h 00 min of time, 1,000,000", prompt
+    )
+    told = re.search(
+        r'\\"left\\": ?{\\"wall_time_s\\": ?(\d+), ?\\"model_tokens\\": ?(\d+)}', json.dumps(api.requests[1])
+    )
+    assert told is not None, api.requests[1]
+    assert 42_000 < int(told[1]) <= 43_200
+    assert 0 < int(told[2]) <= 10**6
+
+
 def test_a_spent_model_budget_ends_the_run_with_what_it_has(tmp_path: Path, operator: Path) -> None:
     record, api, text = played(tmp_path, operator, [SUBMIT, *[Step(command="true")] * 9], max_requests=3)
     assert (record.outcome.status, record.outcome.closed_reason) == ("completed", "model_budget_spent")

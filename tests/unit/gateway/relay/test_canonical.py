@@ -47,6 +47,8 @@ TEXTS = [
     (json.dumps("sys\t0m0.013s"), json.dumps("sys\t0m0.011s")),
     ("Ran 1 test in 0.000s", "Ran 1 test in 0.012s"),
     ("<P object at 0x7fb98a3c5d10>", "<P object at 0x7f11c2a09d90>"),
+    ("Go on. Left: 11 h 58 min of time, 99,000 tokens", "Go on. Left: 0 h 02 min of time, 1,000,000 tokens"),
+    ('{"left": {"wall_time_s": 43100}}', '{"left": {"wall_time_s": 7, "model_tokens": 12}}'),
     ("Inode: 2360997     Links: 1", "Inode: 99          Links: 1"),
 ]
 SAME = [*FIELDS, *(("messages", said(one), said(other)) for one, other in TEXTS)]
