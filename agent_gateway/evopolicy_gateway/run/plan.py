@@ -22,6 +22,7 @@ from evopolicy_common.records.open_run import IntendedRun
 from evopolicy_common.records.run_files import read_record
 from evopolicy_common.records.run_record import AgentLimits
 from evopolicy_gateway import harnesses
+from evopolicy_gateway.harnesses.coding_agents import llm
 from evopolicy_gateway.harnesses.interface.agent_config import USUAL_COST, AgentConfig
 from evopolicy_gateway.harnesses.interface.base import Harness
 from evopolicy_gateway.jail.settings import JailSettings
@@ -105,12 +106,12 @@ class Plan(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def known_config(self) -> AgentConfig | None:
-        """A coding agent's settings with the operator's prices, and with the usual limit of the cost: with prices, and
-        not in a published profile."""
+        """A coding agent's settings with the operator's or the provider's prices, and with the usual limit of the cost:
+        where there are prices, and not in a published profile."""
         config = self.config or harnesses.config_of(self.agent, self.started_in)
         if config is None:
             return None
-        prices = self.prices or config.prices
+        prices = self.prices or llm.prices_of(config)
         usual = USUAL_COST if prices is not None and self.settings.profile == "own" else None
         return msgspec.structs.replace(config, prices=prices, max_cost=config.max_cost or usual)
 

@@ -6,9 +6,11 @@ it. The API's key stays outside its jail.
 
 from __future__ import annotations
 
+import functools
 import json
 import os
 import sys
+from datetime import UTC, datetime
 from importlib import metadata
 from typing import Any
 
@@ -20,6 +22,7 @@ from evopolicy_gateway.harnesses.coding_agents.claude_code import ClaudeReader
 from evopolicy_gateway.harnesses.coding_agents.dialect import Dialect
 from evopolicy_gateway.harnesses.interface.agent_config import PROVIDERS, AgentConfig, ApiTable
 from evopolicy_gateway.inputs.declared import IN_JAIL, SKILL
+from evopolicy_gateway.relay.usage import Prices
 
 _FORM = "--agent llm:PROVIDER/MODEL"
 _CLIENTS = {"openai": "openai", "anthropic": "anthropic", "google": "google-genai"}
@@ -100,3 +103,33 @@ def config_of(rest: str) -> AgentConfig:
         )
     api = msgspec.convert({"provider": provider}, ApiTable)
     return AgentConfig(harness="llm", model=model, api=api)
+
+
+def prices_of(config: AgentConfig) -> Prices | None:
+    """The prices in the settings, else the list prices of the built-in agent's provider at its own address."""
+    api = config.api
+    if config.prices is not None or config.harness != Llm.name or api is None or api.base_url:
+        return config.prices
+    provider = {"moonshot": "moonshotai"}.get(api.provider or "", api.provider or "")
+    return listed_prices(provider, config.model or "")
+
+
+@functools.cache
+def listed_prices(provider: str, model: str) -> Prices | None:
+    """A provider's list prices in the library genai-prices, of the smallest tier; None where they are not known."""
+    try:
+        from genai_prices.data_snapshot import get_snapshot
+
+        known = (
+            get_snapshot().find_provider_model(model, None, provider, None)[1].get_prices(datetime.now(UTC))
+        )
+    except (ImportError, LookupError):
+        return None
+    fields = ("input_mtok", "output_mtok", "cache_read_mtok", "cache_write_mtok")
+    listed = [getattr(known, field) for field in fields]
+    # A cached token without a price of its own costs as much as another.
+    given, answered, *cached = [None if one is None else float(getattr(one, "base", one)) for one in listed]
+    if given is None or answered is None:
+        return None
+    read, created = (given if one is None else one for one in cached)
+    return Prices(input=given, output=answered, cache_read=read, cache_creation=created)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 
 import msgspec
@@ -9,7 +10,8 @@ import pytest
 
 from evopolicy import _cluster
 from evopolicy_common.errors import ConfigError
-from evopolicy_gateway.harnesses.interface.agent_config import AgentConfig
+from evopolicy_gateway.harnesses.coding_agents.llm import listed_prices, prices_of
+from evopolicy_gateway.harnesses.interface.agent_config import AgentConfig, ApiTable
 from evopolicy_gateway.relay.usage import Prices
 from evopolicy_gateway.run.texts import Texts, read, read_prices
 from evopolicy_gateway.workspace.prompts import FIRST, NEXT_TURN, STANDARD, Prompts
@@ -129,3 +131,20 @@ def test_prices_limit_the_cost_but_in_a_published_profile(tmp_path: Path) -> Non
         terms = plan.harness().model
         assert terms is not None
         assert terms.limits.max_cost == expected
+
+
+def test_the_built_in_agent_knows_its_providers_list_prices(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("ANTHROPIC_API_KEY", "key-of-nobody")
+    plan = _cluster.plan_of("toy/line", "llm:anthropic/claude-sonnet-4-5", exp_id="e")
+    terms = plan.harness().model
+    assert terms is not None
+    assert terms.prices is not None
+    assert 0.0 < terms.prices.cache_read < terms.prices.input < terms.prices.output
+    assert terms.limits.max_cost == 20.0
+    own = ApiTable(provider="anthropic", base_url="http://127.0.0.1:1")
+    assert prices_of(AgentConfig(harness="llm", model="claude-sonnet-4-5", api=own)) is None
+    assert listed_prices("anthropic", "no-such-model") is None
+    monkeypatch.setitem(sys.modules, "genai_prices.data_snapshot", None)
+    assert listed_prices.__wrapped__("anthropic", "claude-sonnet-4-5") is None
