@@ -11,10 +11,13 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import pytest
 from commands import Command, command, record_in, run_arguments, run_dir, toy_cluster
 from stages import odd_answers
 from stages.model_api import CACHED, INPUT, OUTPUT, ModelApi, Step, llm_agent
+from stages.provider_api import FRESH, ProviderApi, Said
+from stages.provider_api import OUTPUT as ANSWERED
 from waiting import wait_until
 
 from evopolicy_common.records import model_record
@@ -306,3 +309,24 @@ def test_a_recorded_agent_replays_to_the_byte_without_its_model(
     assert out.startswith("request 0 to ")
     assert "+" in out
     assert "You are somebody else." in out
+
+
+@pytest.mark.parametrize("api_name", ["responses", pytest.param("messages", marks=pytest.mark.system)])
+def test_a_run_with_reasoning_replays_to_the_byte_over_each_api(
+    tmp_path: Path, operator: Path, api_name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    commands = [EDIT.command or "", SUBMIT.command or ""] * 3
+    script = [Said(commands=(each, "ls"), reasoning=f"thought {n}") for n, each in enumerate(commands)]
+    with ProviderApi(api_name, script) as api:
+        agent = llm_agent(tmp_path, api.base_url.removesuffix("/v1"), api_name)
+        with command(tmp_path, *run_arguments(operator, agent), "--record-model", "full") as running:
+            assert running.wait() == 0, running.text
+    use, tokens = used_in(record_in(run_dir(tmp_path)))
+    assert (use.requests, use.requests_failed) == (len(api.requests), 0)
+    # The relay's counts, the agent's own, and the server's are the same.
+    assert use.reported == msgspec.structs.replace(tokens, reasoning=None)
+    assert (tokens.input_noncached, tokens.output) == (api.n_answered * FRESH, api.n_answered * ANSWERED)
+    monkeypatch.delenv("MODEL_ACCESS")
+    again = ["replay", str(run_dir(tmp_path)), "--credentials", str(operator)]
+    with command(tmp_path, *again) as running:
+        assert running.finish()[:2] == (0, "identical\n"), running.text
