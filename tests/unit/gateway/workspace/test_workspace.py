@@ -198,16 +198,6 @@ def test_info_has_the_protocols_fields_and_no_more_of_the_cluster() -> None:
     assert info_document(machine)["state"]["is_finalized"] is True
 
 
-@pytest.mark.parametrize("existing", ["first", ".first.lock", ".first.asked"])
-def test_a_run_of_an_earlier_version_keeps_its_folder(existing: str, tmp_path: Path) -> None:
-    earlier = tmp_path / "e" / "my_env:Glider-v0"
-    earlier.mkdir(parents=True)
-    (earlier / existing).touch()
-    assert run_folder(tmp_path, "e", "my_env:Glider-v0", "first").root == earlier / "first"
-    new = run_folder(tmp_path, "e", "my_env:Glider-v0", "second").root
-    assert new == tmp_path / "e" / "my_env_Glider-v0" / "second"
-
-
 def test_a_runs_folder_has_no_surprises_in_its_name(tmp_path: Path) -> None:
     folder = run_folder(tmp_path, "GPT-5.5 (Codex)/../x", "gym/acrobot", "first")
     assert folder.root == tmp_path / "GPT-5.5 (Codex)_.._x-e5823f47" / "gym_acrobot" / "first"
