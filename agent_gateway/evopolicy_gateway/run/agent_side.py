@@ -137,6 +137,8 @@ class AgentSide:
             reason = "model_budget_spent"
         reason = CANCELLED if self.cancelled else reason
         run.note(", ".join(filter(None, (f"agent ended: {in_words(reason)}", ended.detail))))
+        if not run.folder.model_requests.exists() and (tokens := ended.facts.get("tokens")):
+            run.note(f"model use, as the agent counted: {model_relay.use_words(tokens)}")
         if reason == "agent_failed":
             for line in ended.stderr_tail:
                 run.note(f"stderr: {line}")

@@ -13,8 +13,9 @@ import secrets
 import socket
 import sys
 import sysconfig
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import Any
 
 import msgspec
 
@@ -92,12 +93,14 @@ class ModelRelay(Kept):
         plan, used = self._run.plan, ledger.read(self._run.folder.model_requests)
         config = plan.known_config
         tokens = used.usage.recorded(None if config is None else config.prices)
-        cost = tokens.pop("cost", None)
-        kinds = ", ".join(f"{name.replace('_', ' ')} {count:,}" for name, count in tokens.items())
-        price = "no prices known" if cost is None else f"{cost:,.2f} dollars"
-        self._run.note(
-            f"model use: {used.requests:,} requests ({used.failed:,} failed), tokens: {kinds}; {price}"
-        )
+        self._run.note(f"model use: {used.requests:,} requests ({used.failed:,} failed), {use_words(tokens)}")
+
+
+def use_words(tokens: Mapping[str, Any]) -> str:
+    """Tokens by kind and their cost, in the form of `run.json`, for people."""
+    kinds = ", ".join(f"{name.replace('_', ' ')} {n:,}" for name, n in tokens.items() if name != "cost")
+    price = f"{tokens['cost']:,.2f} dollars" if "cost" in tokens else "no prices known"
+    return f"tokens: {kinds}; {price}"
 
 
 def of_run(run: OpenRun, ready: Ready, model_spent: asyncio.Event) -> ModelRelay | None:

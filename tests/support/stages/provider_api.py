@@ -14,8 +14,8 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
 
 Document = dict[str, Any]
-Refuses = Callable[[Document], tuple[int, Any] | None]
-"""A request's document → status and body of an error, or None."""
+Refuses = Callable[[Document], tuple[Any, ...] | None]
+"""A request's document → status and body of an error, perhaps with its headers, or None."""
 Sends = Callable[["ProviderApi", Any, Document, "Said"], bool]
 """Writes an answer of its own to the server's handler; False: the usual one is sent."""
 FRESH, CACHED, OUTPUT = 300, 700, 20
@@ -307,7 +307,7 @@ class ProviderApi:
                 with provider._lock:
                     provider.requests.append(request)
                     if (refused := refuses(request) or provider._changed(request)) is not None:
-                        self.send(*refused)
+                        self.send(*refused[:2], **dict(*refused[2:]))
                         return
                     n, more = len(provider._sent), Said(text="Nothing more to do.")
                     said = provider.script[n] if n < len(provider.script) else more

@@ -64,6 +64,7 @@ _NO_TOOLS = re.compile(
     r"tool.{0,60}(support|enabl|allow|requires|parser)|(support|enabl|allow).{0,60}tool", re.I
 )
 _MAX_NAMES = 20
+_LEAST_QUOTA_WAIT_S = 60.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -185,8 +186,11 @@ class Conversation:
         if too_long or (status in (400, 413) and _TOO_LONG.search(words)):
             why = f"the conversation is longer than the model's context, set context_tokens below it: {words}"
             return ApiError(why, status, too_long=True)
+        wait_s = error.retry_after
         if isinstance(error, errors.ModelQuotaExceededError):
             words = f"quota exceeded: {words}"
+            # A shorter wait is the relay's or the server's usual one, and brings no quota back.
+            wait_s = wait_s if wait_s is not None and wait_s > _LEAST_QUOTA_WAIT_S else None
         elif isinstance(error, errors.ModelAuthenticationError):
             words = (
                 f"the provider does not accept the key in {self._of['variable'] or 'no variable'}: {words}"
@@ -198,7 +202,7 @@ class Conversation:
             near = difflib.get_close_matches(self._of["model"], names, _MAX_NAMES, 0.0)
             listed = f"; the server lists {', '.join(near)}" if near else ""
             words = f"there is no model {self._of['model']} for this key: {words}{listed}"
-        return ApiError(words, status, error.retry_after)
+        return ApiError(words, status, wait_s)
 
     async def _response(self) -> ModelResponse:
         request = (self.messages, self._settings, self._known)

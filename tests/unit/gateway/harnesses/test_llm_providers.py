@@ -208,7 +208,7 @@ async def test_calls_in_another_form_are_understood(sends: Sends, n_more: int) -
     assert len(server.requests) == 4 + n_more
 
 
-def refusing_stream_options(request: Document) -> tuple[int, Any] | None:
+def refusing_stream_options(request: Document) -> tuple[Any, ...] | None:
     """As Mistral and others whose schema is closed."""
     fault = {
         "type": "extra_forbidden",
@@ -224,7 +224,7 @@ async def test_a_refused_option_of_streams_is_left_out() -> None:
     assert len(server.requests) == 5
 
 
-def without_reasoning_in_chat(request: Document) -> tuple[int, Any] | None:
+def without_reasoning_in_chat(request: Document) -> tuple[Any, ...] | None:
     """As OpenAI's newest models: tools and reasoning together only in Responses."""
     if "messages" in request and request.get("reasoning_effort") != "none":
         words = "Function tools with reasoning are not supported in /v1/chat/completions. Use /v1/responses."
@@ -351,6 +351,18 @@ async def test_errors_say_what_is_wrong_in_the_users_words(
     ):
         await conversed(server, api, 1, variable="THE_KEY")
     assert raised.value.too_long is ("context" in words)
+
+
+@pytest.mark.parametrize(("stated", "wait_s"), [("2", None), ("3600", 3600.0)])
+async def test_only_a_long_stated_wait_counts_for_a_spent_quota(stated: str, wait_s: float | None) -> None:
+    error = {"error": {"message": "You exceeded your current quota.", "code": "insufficient_quota"}}
+    headers = {"retry_after": stated, "x_should_retry": "false"}
+    with (
+        ProviderApi("chat", SCRIPT, refuses=lambda request: (429, error, headers)) as server,
+        pytest.raises(ApiError, match="quota exceeded") as raised,
+    ):
+        await conversed(server, "chat", 1)
+    assert raised.value.retry_after_s == wait_s
 
 
 class Heard:
