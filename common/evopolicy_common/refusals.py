@@ -58,10 +58,11 @@ class Refusal(StrEnum):
         return cls.OTHER
 
 
-RUN_OVER = frozenset(
-    {Refusal.BAD_TOKEN, Refusal.RUN_CANCELLED, Refusal.RUN_CLOSED, Refusal.RUN_FINISHED, Refusal.UNKNOWN_RUN}
-)
+RUN_OVER = frozenset({Refusal.RUN_CANCELLED, Refusal.RUN_CLOSED, Refusal.RUN_FINISHED})
 """For a run's gateway: no further request of this run is served."""
+
+RUN_LOST = frozenset({Refusal.BAD_TOKEN, Refusal.UNKNOWN_RUN})
+"""For a run's gateway: the coordinator was started on a backup from before the run; its command opens the run again."""
 
 NOT_NOW = frozenset({Refusal.NO_WORKER, Refusal.UNAVAILABLE})
 """Retry: no worker has described the environment yet, or the coordinator's disk is full."""

@@ -205,7 +205,7 @@ class _Twins:
         """One round, with its runs compared to those of the undisturbed one; how many runs it had."""
         cluster = self._cluster
         sweep = cluster.root / f"{name}.toml"
-        sweep.write_text(_sweep(name, cluster.agent))
+        sweep.write_text(_sweep(name, cluster.agent()))
         arguments = {
             "run": [
                 *(
@@ -213,7 +213,7 @@ class _Twins:
                     "--env",
                     "toy/line",
                     "--agent",
-                    cluster.agent,
+                    cluster.agent(),
                     "--entry",
                     "tester",
                     "--exp-id",

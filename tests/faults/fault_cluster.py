@@ -10,12 +10,13 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
 import threading
 import time
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from pathlib import Path
 from typing import IO, Any, Literal
 
@@ -66,10 +67,10 @@ class Policy:
         return [random.uniform(-1, 1) * %%r]
 """
 
-def submit(ids, key):
+def submit(ids, key, how):
     while True:
         request = urllib.request.Request(
-            os.environ["EVOPOLICYGYM_SUBMIT_URL"],
+            os.environ["EVOPOLICYGYM_SUBMIT_URL"] + how,
             data=json.dumps({"env_instances": ids}).encode(),
             headers={"Idempotency-Key": key},
         )
@@ -79,6 +80,9 @@ def submit(ids, key):
         except (OSError, ValueError, http.client.HTTPException):
             time.sleep(0.1)
 
+if %r:
+    with open("starts.txt", "a") as starts:
+        starts.write("started\\n")
 for number in range(%d):
     while True:
         try:
@@ -86,8 +90,14 @@ for number in range(%d):
             break
         except OSError:
             time.sleep(0.1)
-    submit(list(range(number, number + %d)), f"submit-{number}")
+    last = %r and number == %d
+    submit(list(range(number, number + %d)), f"submit-{number}", "?wait=false" if last else "")
 '''
+"""An agent that submits several times. One that leaves notes each start of it, and ends while its last submit plays."""
+
+
+def _agent(leaves: bool) -> str:
+    return AGENT % (leaves, SUBMITS, leaves, SUBMITS - 1, EPISODES)
 
 
 class Kept:
@@ -98,6 +108,7 @@ class Kept:
         self._log = log
         self._environment = {**os.environ, **environment}
         self._ending = False
+        self._lock = threading.Lock()
         self.starts = 0
         self._start()
         self._thread = threading.Thread(target=self._keep, daemon=True)
@@ -114,8 +125,18 @@ class Kept:
         while True:
             self.process.wait()
             time.sleep(0.2)
-            if self._ending:
-                return
+            with self._lock:
+                if self._ending:
+                    return
+                if self.process.poll() is not None:
+                    self._start()
+
+    def replaced(self, meanwhile: Callable[[], None]) -> None:
+        """Kills it, and starts it once `meanwhile` has returned."""
+        with self._lock:
+            self.process.kill()
+            self.process.wait()
+            meanwhile()
             self._start()
 
     def end(self) -> None:
@@ -192,8 +213,9 @@ class FaultCluster:
             stack.callback(self.workers[-1].end)
         self.afterwards: list[operator.CancelRun] = []
         """What the coordinator is to be told once a fault is over."""
-        self._agent = root / "agent.py"
-        self._agent.write_text(AGENT % (SUBMITS, EPISODES))
+        self._agents = {False: root / "agent.py", True: root / "leaving_agent.py"}
+        for leaves, path in self._agents.items():
+            path.write_text(_agent(leaves))
 
     def _reach(self, endpoint: str) -> None:
         """All roles reach the coordinator there alone."""
@@ -211,16 +233,30 @@ class FaultCluster:
 
     def command(self, name: str) -> subprocess.Popen[str]:
         """A run that has been started, or after its command was killed: that is gone on with."""
-        arguments = ["run", "--env", "toy/line", "--agent", self.agent]
-        arguments += ["--entry", "tester", "--exp-id", name, "--budget", str(SUBMITS * EPISODES), "--resume"]
-        arguments += ["--validation", str(HIDDEN), "--heldout", str(HIDDEN), "--runs", str(self.runs)]
-        self.run = self.operator_command(arguments)
+        self.run = self.operator_command(self.arguments(name))
         return self.run
 
-    @property
-    def agent(self) -> str:
+    def arguments(self, name: str, *, leaves: bool = False) -> list[str]:
+        arguments = ["run", "--env", "toy/line", "--agent", self.agent(leaves)]
+        # One that leaves does so before its budget is spent: else either could end the run.
+        budget = SUBMITS * EPISODES + leaves
+        arguments += ["--entry", "tester", "--exp-id", name, "--budget", str(budget), "--resume"]
+        return [*arguments, "--validation", str(HIDDEN), "--heldout", str(HIDDEN), "--runs", str(self.runs)]
+
+    def agent(self, leaves: bool = False) -> str:
         """As `--agent` takes it."""
-        return f"command:{sys.executable} {self._agent}"
+        return f"command:{sys.executable} {self._agents[leaves]}"
+
+    def restore(self, backup: Path) -> None:
+        """The coordinator is killed, its state lost, and another one started on the backup."""
+
+        def replace() -> None:
+            for path in self.state.iterdir():
+                shutil.rmtree(path) if path.is_dir() else path.unlink()
+            shutil.copytree(backup, self.state, dirs_exist_ok=True)
+            self.state.chmod(0o700)
+
+        self.coordinator.replaced(replace)
 
     def operator_command(
         self, arguments: list[str], stderr: int | IO[str] = subprocess.PIPE

@@ -27,6 +27,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 import chaos
+import restores
 from coordinator_harness import OperatorClient
 from fault_cluster import EPISODES, SUBMITS, TIMEOUT_S, TOTAL, FaultCluster, Site, fault_cluster, record
 from host_faults import enter_namespaces, full_file_system, out_of_memory, read_only_mount
@@ -67,6 +68,7 @@ ONE_HOST = (
     ("link", "cut"),
     ("link", "stalled past its leases"),
     ("link", "slow"),
+    *restores.ROWS,
 )
 FAULTS: dict[Site, tuple[tuple[str, str], ...]] = {
     "one host": ONE_HOST,
@@ -75,6 +77,7 @@ FAULTS: dict[Site, tuple[tuple[str, str], ...]] = {
         ("cable", "cut past its leases"),
         ("cable", "cut for minutes"),
         ("cable", "slow"),
+        *restores.OVER_A_CABLE,
     ),
     "relay": (
         ("relay", "cut"),
@@ -103,6 +106,8 @@ SELECTED = frozenset(
         ("runs", "over quota"),
         ("clock", "5 h forward"),
         ("clock", "5 h back, all restarted"),
+        ("run", "backup alive, lost closed"),
+        ("two suites", "backup alive, lost scored"),
     }
 )
 """What the test suite plays, at one instant each."""
@@ -391,6 +396,23 @@ def play_all(wanted: list[Case], on_row: Callable[[Row], None], root: Path) -> b
     return well and not left
 
 
+def play_restored(cluster: FaultCluster, name: str, case: Case) -> Row:
+    """A row of `restores`; its runs are compared with one that the same agent has played undisturbed."""
+    started, twin = time.monotonic(), cluster.folder("twin")
+    if not twin.exists():
+        command = cluster.operator_command(cluster.arguments("twin", leaves=True))
+        command.communicate(timeout=TIMEOUT_S)
+    row = Row(case.target, case.fault, case.seed, 0, struck=True, phase="as it says")
+    restored, row.wrong = restores.play(
+        cluster, case.target, case.fault, name, cluster.root / f"{name}-backup"
+    )
+    row.took_s = round(time.monotonic() - started, 1)
+    for folder in restored.folders():
+        check(cluster, row, folder, twin)
+    row.wrong = [each for each in row.wrong if not each.startswith("run.json: repeat: ")]
+    return row
+
+
 def play_at(cluster: FaultCluster, site: Site, wanted: list[Case], on_row: Callable[[Row], None]) -> bool:
     first = play(cluster, "undisturbed")
     first.fault = site
@@ -400,8 +422,11 @@ def play_at(cluster: FaultCluster, site: Site, wanted: list[Case], on_row: Calla
     well = not first.wrong
     for number, case in enumerate(wanted):
         name = f"run-{number}"
-        row = play(cluster, name, case)
-        check(cluster, row, cluster.folder(name), undisturbed)
+        if case.fault.startswith("backup"):
+            row = play_restored(cluster, name, case)
+        else:
+            row = play(cluster, name, case)
+            check(cluster, row, cluster.folder(name), undisturbed)
         well = well and not row.wrong
         on_row(row)
     return well
@@ -438,8 +463,8 @@ def main() -> None:
         if options.json:
             print(json.dumps({**asdict(row), "outcome": row.outcome}), flush=True)
         else:
-            when = f"after {row.after} episodes ({row.phase})" if row.phase else ""
-            print(f"{row.target:<12}{row.fault:<25}{when:<34}{row.took_s:>6} s  {row.outcome}", flush=True)
+            when = f"after {row.after} episodes ({row.phase})" if row.after else row.phase
+            print(f"{row.target:<12}{row.fault:<40}{when:<34}{row.took_s:>6} s  {row.outcome}", flush=True)
 
     enter_namespaces()
     # Ended from outside, it still takes everything down that it has started.

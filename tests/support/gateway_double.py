@@ -6,6 +6,8 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import json
+import shutil
+import sqlite3
 from collections.abc import AsyncIterator, Callable
 from pathlib import Path
 from typing import Any
@@ -250,6 +252,23 @@ class Double:
         for end in ended:
             if isinstance(end, Exception):
                 raise end
+
+    def back_up(self, target: Path) -> None:
+        """Copies the coordinator's database."""
+        source, copy = (sqlite3.connect(path) for path in (self.world.root / "db", target))
+        with contextlib.closing(source), contextlib.closing(copy):
+            source.backup(copy)
+
+    async def restore(self, backup: Path) -> None:
+        """Another coordinator is started on that copy, without the bundles. The run is opened as its command does."""
+        root, self.up = self.world.root, False
+        await self.stop()
+        for path in (*root.glob("db*"), *root.glob("blobs/*")):
+            shutil.rmtree(path) if path.is_dir() else path.unlink()
+        shutil.copy(backup, root / "db")
+        self._held.clear()
+        await self.start(root)
+        self.up = True
 
     async def _create(self, key: str) -> operator.RunCreated:
         run = self.run

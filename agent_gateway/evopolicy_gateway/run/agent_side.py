@@ -44,7 +44,8 @@ class AgentSide:
 
     @property
     def closed(self) -> bool:
-        return self._gateway.closed
+        """Whether the run is closed, or its agent has ended and only the closing is left."""
+        return self._gateway.closed or self._run.folder.closing.exists()
 
     @property
     def agent_at_work(self) -> bool:
@@ -53,7 +54,10 @@ class AgentSide:
 
     async def play(self) -> None:
         """Plays until the run is closed; returns at once if it is. Raises EvopolicyError."""
-        if self.closed:
+        if self._gateway.closed:
+            return
+        if self._run.folder.closing.exists():
+            await self.close_again()
             return
         tasks: list[asyncio.Task[Any]] = []
 
@@ -63,14 +67,14 @@ class AgentSide:
 
         served = self._run.served
         relay: model_relay.ModelRelay | None = None
-        serving = begin(self._gateway.keep())
-        begin(self._follow())
+        serving, following = begin(self._gateway.keep()), begin(self._follow())
         ends = [begin(self._model_spent.wait()), begin(self._spent.wait())]
         try:
-            up: list[asyncio.Future[Any]] = [serving, served]
+            up: list[asyncio.Future[Any]] = [serving, served, following]
             await asyncio.wait(up, return_when=asyncio.FIRST_COMPLETED)
-            if serving.done():
-                serving.result()
+            for task in (serving, following):
+                if task.done():
+                    task.result()
             if not served.done():
                 return  # cancelled before it was served
             ready = served.result()
@@ -79,9 +83,9 @@ class AgentSide:
             relaying = [] if relay is None else [begin(relay.serve())]
             address = None if relay is None else relay.address
             keeping = begin(self.agent.keep(ready, address, self._spent))
-            going: list[asyncio.Future[Any]] = [serving, keeping, *ends, *relaying]
+            going: list[asyncio.Future[Any]] = [serving, keeping, following, *ends, *relaying]
             await asyncio.wait(going, return_when=asyncio.FIRST_COMPLETED)
-            for task in relaying:
+            for task in (*relaying, following):
                 if task.done():
                     task.result()
             if not serving.done() and not keeping.done():
@@ -104,6 +108,13 @@ class AgentSide:
                     await child.end(END_GRACE_S)
             self.agent.survivors = await messages.end_orphans()
             self._run.stopwatch.closed()
+
+    async def close_again(self) -> None:
+        """Has the run closed whose agent has ended: a coordinator on an earlier backup has lost the closing."""
+        try:
+            await self._gateway.keep()
+        finally:
+            await self._gateway.end(END_GRACE_S)
 
     async def _follow(self) -> None:
         """Prints why the run is not served yet; ends the agent of a cancelled run."""

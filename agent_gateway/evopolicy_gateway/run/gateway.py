@@ -8,6 +8,8 @@
   place.
 - Closing the run ends the permit, so it follows the agent's end, which the parent or else the operator (`evopolicy
   finish`) reports.
+- The order to close the run is durable before it is carried out, and the next gateway repeats it: the coordinator may
+  have been started on a backup from before the closing.
 - The gateway keeps renewing the permit: a report that an agent elsewhere is gone may have ended this one's.
 """
 
@@ -24,7 +26,7 @@ import msgspec
 
 from evopolicy_common.errors import ConfigError, RefusedError
 from evopolicy_common.logs import structlog
-from evopolicy_common.records.open_run import Closed, OpenedRun
+from evopolicy_common.records.open_run import OpenedRun
 from evopolicy_common.refusals import RUN_OVER
 from evopolicy_common.wire import credentials, transport
 from evopolicy_common.wire.http import serving
@@ -32,7 +34,7 @@ from evopolicy_gateway.http.server import bind
 from evopolicy_gateway.http.service import make_app
 from evopolicy_gateway.processes.child_messages import CloseRun
 from evopolicy_gateway.run_folder.journal import Journal
-from evopolicy_gateway.run_folder.layout import RunFolder, saved
+from evopolicy_gateway.run_folder.layout import RunFolder, save, saved
 from evopolicy_gateway.run_folder.listener import AgentPlace, agent_place, ends_unseen
 from evopolicy_gateway.submits.coordinator_client import CoordinatorClient
 from evopolicy_gateway.submits.pipeline import SubmitPipeline
@@ -87,6 +89,8 @@ class Gateway:
         folder = self._folder
         own, known = _load(folder, *self._place_of_credentials)
         run, self._place = known.run, self._place or agent_place(folder)
+        if folder.closing.exists():
+            self.tell(saved(folder.closing, CloseRun))
         async with contextlib.AsyncExitStack() as stack:
             sock, address = await bind(folder)
             stack.callback(sock.close)
@@ -115,7 +119,7 @@ class Gateway:
                 stack.callback(asyncio.ensure_future(session.keep_permit(self._place)).cancel)
             try:
                 close = await self._watch(pipeline, http)
-                return close is not None and await self._close(session, journal, pipeline, close)
+                return close is not None and await self._close(pipeline, close)
             finally:
                 await pipeline.stop()
 
@@ -152,16 +156,14 @@ class Gateway:
             if self._alone and (spent or self._folder.finish.exists()):
                 return CloseRun(reason="budget_spent" if spent else "agent_stopped")
 
-    async def _close(
-        self, session: CoordinatorClient, journal: Journal, pipeline: SubmitPipeline, close: CloseRun
-    ) -> bool:
+    async def _close(self, pipeline: SubmitPipeline, close: CloseRun) -> bool:
+        await asyncio.to_thread(save, self._folder.closing, close)
         # The agent is gone, but its last submit is still played and written.
         pipeline.machine.close()
         await pipeline.idle()
         if not await self._agent_gone(pipeline):
             return False
-        await session.close(close.reason, close.agent)
-        await asyncio.to_thread(journal.append, Closed(reason=close.reason))
+        await pipeline.close(close.reason, close.agent)
         log.info("run closed", reason=close.reason)
         return True
 

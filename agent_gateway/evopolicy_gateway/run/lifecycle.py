@@ -118,10 +118,10 @@ class RunLifecycle:
             # The command may have been killed before it removed the gateway's folder.
             remove_tree(self._folder.state)
             done, how = read_record(self._folder.root), "it is finished, and this is its result"
-            if await self._operations.phase(done.run) is None:
+            if await self._operations.end_lost(done.run) != "finished":
                 how += (
-                    f"; the cluster has no run {done.run}, so that nothing of it can be verified or re-scored"
-                    " there (another cluster played it, or the state is of an earlier backup); --overwrite"
+                    f"; the cluster has no result of run {done.run}, so that nothing of it can be verified or"
+                    " re-scored there (another cluster played it, or the state is of an earlier backup); --overwrite"
                     " plays it anew"
                 )
             self._note(how)
@@ -208,9 +208,12 @@ class RunLifecycle:
         credentials.write(msgspec.structs.replace(self._credentials, token=token), folder.credentials)
         phase: str | None = "open"
         if resumed:
-            phase = await self._operations.phase(self.run)
+            phase = await self._operations.phase_of(folder)
             if phase is None:
-                raise ConfigError(f"the cluster no longer knows run {self.run} of {folder.root}")
+                raise ConfigError(
+                    f"the cluster does not know run {self.run} of {folder.root}, and cannot open it again: give the"
+                    " cluster that it was opened on, or --overwrite to play it anew"
+                )
             self._note(f"resumes run {self.run} in {folder.root}")
         else:
             save(folder.opened_run, OpenedRun(run=self.run, agents_md=self._plan.texts.agents_md))
@@ -241,6 +244,9 @@ class RunLifecycle:
 
     async def _score(self) -> None:
         async for progress in self._operations.wait(self.run):
+            if progress.phase == "open" and self._side is not None and self._side.closed:
+                # The coordinator was started on a backup from before the closing.
+                await self._side.close_again()
             self._watch.phase(self._plan.name, progress)
         self._finished = progress.finished
 

@@ -13,6 +13,7 @@ from evopolicy_common.messages import operator as messages
 from evopolicy_common.messages.episode import EpisodeOutcome
 from evopolicy_common.processes.notices import notify_if_slow
 from evopolicy_common.records.open_run import IntendedRun, OpenedRun
+from evopolicy_common.records.run_files import read_record
 from evopolicy_common.refusals import WRONG_SETTINGS, Refusal
 from evopolicy_common.wire import credentials
 from evopolicy_common.wire.credentials import Credentials
@@ -33,21 +34,26 @@ class Operations(OperatorClient):
         """`opened`: as `LocalCluster.opened`; None for a cluster that was not started here."""
         super().__init__(link, own=opened is not None)
         self._opened = opened
+        self._intended: dict[str, IntendedRun] = {}
+        """The requests that opened runs, by run: a coordinator on an earlier backup opens them again."""
 
     def watched_by(self, run: str, locks: Sequence[Path]) -> None:
         """Declares that the run's agent is alive only while one of these locks is held."""
         if self._opened is not None:
             self._opened(run, locks)
 
-    async def create(self, wanted: IntendedRun) -> messages.RunCreated:
-        """Opens a run; the same key returns the same run. Raises ConfigError for refused settings."""
-        known = {"key": wanted.key, "replay_key": wanted.replay_key}
+    async def create(self, wanted: IntendedRun, run: str = "") -> messages.RunCreated:
+        """Opens a run, or `run` again; the same key returns the same run. Raises ConfigError for refused settings."""
+        known: dict[str, Any] = {"key": wanted.key, "replay_key": wanted.replay_key, "run": run}
         message = messages.CreateRun(token=self._token, settings=wanted.settings, **known)
         try:
-            kind, how = messages.RunCreated, {"timeout_s": TIMEOUT_S}
-            return await self._requests.until_answered("create", message, kind, despite=_AWAY, **how)
+            timeout_s = None if run else TIMEOUT_S
+            known = {"despite": _AWAY, "timeout_s": timeout_s}
+            created = await self._requests.until_answered("create", message, messages.RunCreated, **known)
         except RefusedError as error:
             raise _settings_error(error) from error
+        self._intended[created.run] = wanted
+        return created
 
     async def wait(self, run: str) -> AsyncIterator[messages.RunProgress]:
         """Yields the run's progress, the finished run last; logs why the coordinator takes no changes."""
@@ -63,13 +69,41 @@ class Operations(OperatorClient):
 
     async def phase(self, run: str) -> str | None:
         """The run's current phase, as `RunProgress.phase`; None when the cluster does not know the run."""
-        with contextlib.suppress(RefusedError):
+        with contextlib.suppress(RefusedError, ConfigError):
             return (await self._progress(run, 0.0)).phase
         return None
 
+    async def phase_of(self, folder: RunFolder) -> str | None:
+        """The phase of a folder's open run, opened again if the cluster has lost it; None when it cannot be."""
+        run = saved(folder.opened_run, OpenedRun).run
+        if folder.intended.exists():
+            self._intended[run] = saved(folder.intended, IntendedRun)
+        return await self.phase(run)
+
+    async def end_lost(self, run: str) -> str | None:
+        """Cancels a run that has ended if a coordinator on an earlier backup still has it open, so that it keeps no
+        hidden episodes waiting. Returns its phase before; None when the cluster does not know it."""
+        self._intended.pop(run, None)
+        phase = await self.phase(run)
+        if phase not in (None, "finished"):
+            await self.cancel(run)
+            await self.agent_gone(run)
+        return phase
+
     async def _progress(self, run: str, wait_s: float) -> messages.RunProgress:
         message = messages.WaitRun(token=self._token, run=run, wait_s=wait_s)
-        return await self._requests.until_answered("wait", message, messages.RunProgress, wait_s=wait_s)
+        while True:
+            try:
+                return await self._requests.until_answered(
+                    "wait", message, messages.RunProgress, wait_s=wait_s
+                )
+            except RefusedError as error:
+                if error.status != Refusal.UNKNOWN_RUN or run not in self._intended:
+                    raise
+            log.warning(
+                "the coordinator has lost the run, as after a restored backup; opening it again", run=run
+            )
+            await self.create(self._intended[run], run)
 
     async def claim(
         self,
@@ -100,6 +134,10 @@ class Operations(OperatorClient):
                 run = (await self.create(intended)).run
             except (ConfigError, RefusedError):
                 return
+        elif folder.run_json.exists():
+            with contextlib.suppress(EvopolicyError):
+                await self.end_lost(read_record(folder.root).run)
+            return
         else:
             return
         with notify_if_slow(f"the agent of {folder.root} to end"):

@@ -96,6 +96,9 @@ class RunFolder(msgspec.Struct, frozen=True):
     """The address that serves a remote agent: `Listener`. Missing for an agent that is started here."""
     bearer = Place(f"{open_run.STATE}/bearer")
     """A remote agent's bearer token, as text."""
+    closing = Place(f"{open_run.STATE}/closing.json")
+    """The order to close the run (`CloseRun`), given once its agent has ended: repeated until the coordinator has
+    closed the run, also after it was started on an earlier backup."""
     finish = Place(f"{open_run.STATE}/finish")
     """Created when the operator reports the end of an agent that was not started here."""
     unwatched = Place(open_run.UNWATCHED)

@@ -1,7 +1,7 @@
 """The gateway's client of the coordinator: typed requests about one run.
 
-Every request is repeated until it is answered, also across restarts of the coordinator, and is safe to repeat. The
-caller decides how to handle a refusal.
+Every request is repeated until it is answered, also across restarts of the coordinator, and until a coordinator that
+has lost the run has it again. It is safe to repeat. The caller decides how to handle any other refusal.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from evopolicy_common.messages import gateway as messages
 from evopolicy_common.messages.episode import BlobRef
 from evopolicy_common.messages.worker import Message
 from evopolicy_common.records.open_run import Requested
-from evopolicy_common.refusals import NOT_NOW
+from evopolicy_common.refusals import NOT_NOW, RUN_LOST
 from evopolicy_common.wire import codec, keys
 from evopolicy_common.wire.requests import Requester
 from evopolicy_common.wire.transport import Link
@@ -38,6 +38,8 @@ RENEWAL_S = 5.0
 FIRST_PERMIT_WAIT_S = 3.0
 """Seconds after which the wait for a permit is shown."""
 STATE_TIMEOUT_S = 1.0
+_PAST_ALL = (1 << 31) - 1
+"""A cursor beyond all results."""
 LARGE_BYTES = 16 << 20
 """A larger recording is kept in a file."""
 _AS_REQUESTED = ("key", "env_instances", "bundle", "bundle_error", "tree")
@@ -49,7 +51,8 @@ Wanted = TypeVar("Wanted")
 
 
 class CoordinatorClient:
-    """Client for one run. Its methods raise RefusedError for refusals other than temporary ones (`NOT_NOW`)."""
+    """Client for one run. Its methods raise RefusedError for refusals that do not end by themselves, and blob requests
+    for any."""
 
     def __init__(self, link: Link, run: str, scratch: Path | None = None) -> None:
         """`scratch`: folder of temporary files; None: the system's."""
@@ -100,23 +103,30 @@ class CoordinatorClient:
                 await self.permit(place, lost)
 
     async def state(self) -> messages.RunState | None:
-        """Returns the run's current state; None when the coordinator does not answer within a second."""
+        """Returns the run's current state; None when the coordinator does not answer within a second, or has lost the
+        run."""
         question = messages.StateRequest(**self._known)
         try:
             async with asyncio.timeout(STATE_TIMEOUT_S):
                 return (await self._requests.once("state", question, messages.StateReply)).state
         except (TransportError, TimeoutError):
             return None
+        except RefusedError as error:
+            if error.status not in RUN_LOST:
+                raise
+            return None
 
     async def upload(self, digest: str, data: bytes) -> None:
         await self._requests.upload(*self._sender, digest, data)
 
-    async def submit(self, request: Requested) -> messages.SubmitAccepted:
-        """Requests an evaluation. The same request gets the same answer however often it is sent."""
+    async def submit(self, request: Requested, after: int) -> messages.SubmitAccepted:
+        """Requests an evaluation, as submit number `after`, from 0. The same request gets the same answer however often
+        it is sent."""
         message = messages.Submit(
             **self._known,
             **{name: getattr(request, name) for name in _AS_REQUESTED},
             rejected=None if request.rejected is None else request.rejected.status,
+            after=after,
         )
         return await self._ask("submit", message, messages.SubmitAccepted)
 
@@ -125,6 +135,11 @@ class CoordinatorClient:
         asked: dict[str, Any] = {"submit_index": submit_index, "cursor": cursor, "wait_s": wait_s}
         question = messages.ResultsRequest(**self._known, **asked)
         return await self._ask("results", question, messages.ResultsPage, wait_s=wait_s)
+
+    async def ended(self, submit_index: int) -> None:
+        """Returns once the submit has ended."""
+        while (await self.results(submit_index, _PAST_ALL, RESULTS_WAIT_S)).done is None:
+            pass
 
     async def fetch(self, ref: BlobRef) -> bytes:
         """Returns the bytes that `ref` names, verified; large ones are in an unnamed temporary file."""
@@ -135,10 +150,13 @@ class CoordinatorClient:
             file.flush()
             return cast(bytes, memoryview(mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)))
 
-    async def close(self, reason: str, agent: dict[str, Any]) -> None:
-        """Closes the run to further submits. Call it only when the agent and all its children are gone."""
-        message = messages.CloseRun(**self._known, reason=reason, agent=agent)
+    async def close(self, reason: str, agent: dict[str, Any], after: int) -> None:
+        """Closes the run to further submits than the `after` accepted ones. Call it only when the agent and all its
+        children are gone."""
+        message = messages.CloseRun(**self._known, reason=reason, agent=agent, after=after)
         await self._ask("close", message, messages.RunClosed)
 
     async def _ask(self, verb: str, message: Message, wanted: type[Wanted], *, wait_s: float = 0.0) -> Wanted:
-        return await self._requests.until_answered(verb, message, wanted, wait_s=wait_s, despite=NOT_NOW)
+        return await self._requests.until_answered(
+            verb, message, wanted, wait_s=wait_s, despite=NOT_NOW | RUN_LOST
+        )

@@ -168,8 +168,12 @@ class Collector:
             await self._write_page(page)
             machine.paged(page, len(scores), held_before)
             self.on_page()
-            if page.done is not None:
+            if page.done is not None and (cursor == 0 or len(scores) >= page.done.n_kept):
                 break
+            if page.done is not None:
+                # Its episodes were played again, in another order, by a coordinator that was started on a backup.
+                cursor = 0
+                continue
             if not page.more:
                 await asyncio.sleep(linger.pause_s(len(scores), time.monotonic()))
         last_result = time.monotonic()
@@ -291,6 +295,6 @@ def _remove(path: Path) -> None:
     if path.is_dir() and not path.is_symlink():
         remove_tree(path)
         if path.exists():
-            raise OSError(errno.ENOTEMPTY, "cannot be removed", str(path))
+            raise OSError(errno.ENOTEMPTY, "an entry in feedback/ cannot be removed", str(path))
     else:
         path.unlink(missing_ok=True)

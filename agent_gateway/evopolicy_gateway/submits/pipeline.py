@@ -3,6 +3,7 @@
 - A request is checked before anything is read from `system/`; one with an invalid form or outside the bounds
   costs nothing.
 - A valid request is in the journal before it is sent, and is repeated by its key after a restart.
+- A coordinator that was started on an earlier backup gets the submits that it has lost once more, and plays them again.
 - A submit continues when no client waits for it any more; its answer is kept.
 - An unexpected error ends the gateway process; the next one resumes from the journal.
 """
@@ -14,7 +15,7 @@ import time
 import uuid
 from collections.abc import Callable
 from functools import partial
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from evopolicy_common.errors import RefusedError, RequestError, StorageError
 from evopolicy_common.logs import structlog
@@ -22,7 +23,7 @@ from evopolicy_common.messages.gateway import RunOpened, SubmitAccepted, SubmitD
 from evopolicy_common.records.blobs import BlobStore
 from evopolicy_common.records.open_run import Accepted, AnyEntry, Died, Requested, Settled
 from evopolicy_common.records.policies.trees import Recorder
-from evopolicy_common.refusals import Refusal
+from evopolicy_common.refusals import RUN_LOST, Refusal
 from evopolicy_gateway.run_folder.journal import Journal
 from evopolicy_gateway.run_folder.layout import RunFolder
 from evopolicy_gateway.submits import snapshots
@@ -123,6 +124,16 @@ class SubmitPipeline:
         while self._task is not None and not self._task.done():
             await asyncio.wait([self._task])
 
+    async def close(self, reason: str, agent: dict[str, Any]) -> None:
+        """Closes the run at the coordinator, with all its submits."""
+        while True:
+            try:
+                return await self._client.close(reason, agent, len(self.machine.accepted))
+            except RefusedError as error:
+                if error.status != Refusal.UNKNOWN_SUBMIT:
+                    raise
+            await self._submit_again()
+
     async def stop(self) -> None:
         """Leaves the submit in flight to the next gateway."""
         if self._task is not None:
@@ -162,7 +173,7 @@ class SubmitPipeline:
                         await asyncio.to_thread(snapshots.record_tree, snapshot, *more)
                     )
                 case "send":
-                    return machine.sent(await self._send(ticket.request))
+                    return machine.sent(await self._send(ticket.request, ticket.index))
                 case "collect":
                     return machine.collected(*await self._collect(ticket))
                 case entry:
@@ -173,6 +184,12 @@ class SubmitPipeline:
                         log.info("submit committed", submit=ticket.submit_id, status=entry.status)
                     return following
         except RefusedError as error:
+            if error.status == Refusal.UNKNOWN_SUBMIT:
+                await self._submit_again()
+                return effect
+            if error.status in RUN_LOST:
+                await asyncio.sleep(DISK_PAUSE_S)
+                return effect
             log.warning("submit refused", submit=ticket.submit_id, status=error.status, why=error.message)
             return machine.refused(error)
         except Exception as error:
@@ -193,14 +210,28 @@ class SubmitPipeline:
                 log.error("the disk refuses; trying again", error=str(error))
             await asyncio.sleep(DISK_PAUSE_S)
 
-    async def _send(self, request: Requested) -> SubmitAccepted:
+    async def _submit_again(self) -> None:
+        """Submits once more what a coordinator on an earlier backup has lost, and waits until it is played."""
+        accepted, state = self.machine.accepted, await self._client.state()
+        known = 0 if state is None else state.n_submits
+        log.warning(
+            "the coordinator has lost submits; sending them again", known=known, accepted=len(accepted)
+        )
+        for ticket in accepted[max(0, known - 1) :]:
+            assert ticket.requested_at is not None
+            request = self._journal.read(ticket.requested_at)
+            assert isinstance(request, Requested)
+            await self._send(request, ticket.index)
+            await self._client.ended(ticket.index)
+
+    async def _send(self, request: Requested, index: int) -> SubmitAccepted:
         while True:
             known = request.bundle is None or request.bundle == self._uploaded
             if request.bundle is not None and not known:
                 data = await asyncio.to_thread(self._blobs.read, request.bundle)
                 await self._client.upload(request.bundle, data)
             try:
-                reply = await self._client.submit(request)
+                reply = await self._client.submit(request, index)
             except RefusedError as error:
                 if error.status != Refusal.MISSING_BUNDLE:
                     raise
@@ -223,7 +254,7 @@ class SubmitPipeline:
             except (OSError, StorageError) as error:
                 # Without the error's paths: an agent reads this text.
                 why = error.strerror if isinstance(error, OSError) else None
-                ticket.waits_for = f"the gateway cannot write feedback: {why or 'its disk refuses'}"
+                ticket.waits_for = f"the gateway to write feedback: {why or 'its disk refuses'}"
                 log.error("cannot write feedback; trying again", submit=ticket.submit_id, error=str(error))
                 self._changed()
                 await asyncio.sleep(DISK_PAUSE_S)

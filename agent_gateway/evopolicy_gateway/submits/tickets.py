@@ -74,8 +74,8 @@ class Ticket(msgspec.Struct, kw_only=True, eq=False):
     """The state of a submit that passed the checks."""
 
     request: Requested
-    requested: bool = False
-    """Whether `request` is in the journal, with its snapshot."""
+    requested_at: int | None = None
+    """Offset of the journal's entry with `request` and its snapshot; None before it is there."""
     index: int
     """Known before it is accepted, because this gateway is the run's only submitter."""
     submit_id: str
@@ -137,9 +137,14 @@ class TicketMachine:
         """The unexpected error of the ticket in flight."""
         for place, entry in (entries or {}).items():
             self.noted(entry, place)
-        # `run.state` is newer than the entries, except for an open submit's acceptance.
-        if not any(each.accepted and not each.done for each in self.tickets):
+        # `run.state` is newer than the entries, except for an open submit's acceptance, and on an earlier backup.
+        if len(self.accepted) <= run.state.n_submits and all(each.done for each in self.accepted):
             self.state = run.state
+
+    @property
+    def accepted(self) -> list[Ticket]:
+        """Submits that a coordinator has accepted, by index."""
+        return [each for each in self.tickets if each.accepted is not None]
 
     @property
     def spent(self) -> bool:
@@ -237,7 +242,7 @@ class TicketMachine:
         if self.in_flight is None:
             return None
         request, rejected = self.in_flight.request, self.in_flight.request.rejected
-        if not self.in_flight.requested:
+        if self.in_flight.requested_at is None:
             return request if rejected else "snapshot"
         if self.in_flight.accepted is None:
             return "send"
@@ -288,7 +293,7 @@ class TicketMachine:
         match entry:
             case Requested():
                 ticket = self.in_flight or self._begin(entry)
-                ticket.request, ticket.requested = entry, True
+                ticket.request, ticket.requested_at = entry, place
             case open_run.Accepted():
                 ticket = self._open
                 ticket.accepted, ticket.index = entry, entry.submit_index
@@ -308,8 +313,6 @@ class TicketMachine:
                 self._end(RequestError("gateway_failed", entry.message))
             case open_run.Rejected():
                 self.n_rejected += 1
-            case open_run.Closed():
-                self.closed = True
         return self.next()
 
     def _settle(self, ticket: Ticket, entry: open_run.Settled, place: int) -> None:

@@ -5,6 +5,7 @@ Rules, in addition to those of every sweep:
 - A run is played only while this host holds its claim at the coordinator. If another host has taken the claim, the run
   ends here and its folder stays unchanged. A host that takes a claim cancels the run that an earlier holder played for
   it.
+- A coordinator that was started anew, perhaps on an earlier backup, is told all results of this host again.
 - Cancelled, the sweep leaves runs open and keeps its claims: the same host can resume them, and others can take them
   over once the claims expire.
 - A provider that is away also holds back further runs of that provider; running ones wait by themselves.
@@ -15,7 +16,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import hashlib
+import secrets
 import socket
 import time
 from collections.abc import Sequence
@@ -29,6 +30,7 @@ from evopolicy_common.errors import EvopolicyError, StorageError
 from evopolicy_common.local.cluster import unless_failed
 from evopolicy_common.messages.operator import ClaimState
 from evopolicy_common.processes.scratch import remove_tree
+from evopolicy_common.records.blobs import write_atomically
 from evopolicy_common.records.open_run import OpenedRun
 from evopolicy_common.records.run_files import read_record
 from evopolicy_common.records.suite_folder import FINISHED, INDEX, PAUSED, Entry, Index
@@ -45,6 +47,9 @@ from evopolicy_gateway.suite.sweep import Sweep
 
 _ASK_AGAIN_S = 5.0
 ATTEMPTS = ".attempts"
+HOLDER = ".holder"
+"""File with the random name of a sweep's folder, which tells hosts of equal names apart."""
+_ID_LENGTH = 64
 
 
 class ClaimedSweep(Sweep):
@@ -59,16 +64,21 @@ class ClaimedSweep(Sweep):
         self._view: SuiteView = known[-1]
         self._root = root.absolute()
         self._host = socket.gethostname()
-        # A host is a machine and a folder: two sweeps of one machine in different folders are two hosts.
-        self._holder = f"{self._host}:{hashlib.sha256(str(self._root).encode()).hexdigest()[:12]}"
+        # A host is a machine and a folder: two sweeps of one machine in different folders are two hosts, and so are
+        # folders of one path on machines of one name.
+        self._holder = f"{self._host}:{_id_of(self._root)}"
         self._not_before: dict[str, float] = {}
         self._paused_until: dict[str, float] = {}
         self._ending: set[str] = set()
         """Cancelled runs that have not ended yet."""
         self._unsaved = False
+        self._coordinator = self._told = ""
+        """The coordinator's process, as its last reply named it, and the one that was told all results of this host."""
         self._view.on_doing = self._on_doing
 
     async def play(self, decisions: Sequence[Decision]) -> None:
+        self._decided = {one.run.name: one for one in decisions}
+        await self._tell_results()
         renewing = asyncio.create_task(self._renew())
         try:
             # Unrenewed claims would pass to another host while their runs continue here.
@@ -131,15 +141,19 @@ class ClaimedSweep(Sweep):
             return True
         if not claim.granted:
             self._not_before[run.name] = time.monotonic() + _ASK_AGAIN_S
-            self._view.elsewhere(run.name, claim.holder.partition(":")[0])
+            self._view.elsewhere(run.name, self._named(claim.holder))
             return False
         others = bool(claim.run) and claim.run != _opened(run)
         if others:
             with contextlib.suppress(EvopolicyError):
                 await self._operations.cancel(claim.run)
         if claim.previous:
-            self._view.note(run.name, f"taken over from {claim.previous.partition(':')[0]}")
-        if claim.previous or (others and decision.kind in ("resume", "finish")):
+            self._view.note(run.name, f"taken over from {self._named(claim.previous)}")
+        if decision.kind in ("resume", "finish"):
+            taken = bool(claim.previous) or (others and not claim.kept)
+            if taken or await self._operations.phase_of(run.folder) is None:
+                decision = self._anew(run.name)
+        elif claim.previous:
             decision = self._anew(run.name)
         return await super()._begin(decision)
 
@@ -186,6 +200,8 @@ class ClaimedSweep(Sweep):
             await asyncio.sleep(min(sweep.POLL_S, every_s))
             if self._unsaved:
                 self._save()
+            if self._coordinator != self._told:
+                await self._tell_results()
             for name, task in list(self._active.items()):
                 run = self._decided[name].run
                 known, at = renewed.get(name, ("", 0.0))
@@ -196,9 +212,12 @@ class ClaimedSweep(Sweep):
                     renewed[name] = (self._run_of(run), time.monotonic())
                     claim = await self._ask(run)
                     if not claim.granted and claim.holder != self._holder and not task.done():
-                        # That host has cancelled our run at the cluster.
+                        # That host has cancelled our run at the cluster, if it knew of it.
+                        await self._operations.cancel(self._run_of(run))
                         self._anew(name)
-                        self._end(name, task, f"another host has it now ({claim.holder}): ended here")
+                        self._end(
+                            name, task, f"another host has it now ({self._named(claim.holder)}): ended here"
+                        )
 
     async def _ask(
         self, run: Plan, ttl_s: float | None = None, result: dict[str, Any] | None = None
@@ -207,7 +226,25 @@ class ClaimedSweep(Sweep):
         name = f"{run.name}@{run.digest}"
         ttl_s = self._limits.claim_ttl_s if ttl_s is None else ttl_s
         known = (self._suite.name, name, self._holder, ttl_s, self._run_of(run), result)
-        return await self._operations.claim(*known)
+        claim = await self._operations.claim(*known)
+        self._coordinator = claim.coordinator
+        self._told = self._told or claim.coordinator
+        return claim
+
+    async def _tell_results(self) -> None:
+        """Settles the claims of this host's finished runs again, and ends what a restored coordinator has of them."""
+        told = self._coordinator
+        for name, entry in list(self._index.runs.items()):
+            decision = self._decided.get(name)
+            ours = entry.state in FINISHED and entry.directory and name not in self._active
+            if decision is None or not ours or entry.digest != decision.run.digest:
+                continue
+            with contextlib.suppress(EvopolicyError):
+                claim = await self._ask(decision.run, None, msgspec.to_builtins(entry))
+                if claim.granted and claim.run not in ("", entry.run):
+                    await self._operations.cancel(claim.run)
+                await self._operations.end_lost(entry.run)
+        self._told = told or self._told
 
     def _put_aside(self, folder: RunFolder, attempt: int) -> None:
         """Keeps the files of an earlier attempt."""
@@ -226,6 +263,11 @@ class ClaimedSweep(Sweep):
         before = self._decided[name]
         self._decided[name] = msgspec.structs.replace(before, kind="restart", attempt=before.attempt + 1)
         return self._decided[name]
+
+    def _named(self, holder: str) -> str:
+        """A host's name for people."""
+        host = holder.partition(":")[0]
+        return f"another folder or machine of the name {host}" if host == self._host else host
 
     def _run_of(self, run: Plan) -> str:
         play = self._plays.get(run.name)
@@ -278,6 +320,15 @@ class ClaimedSweep(Sweep):
             self._unsaved = False
 
 
+def _id_of(root: Path) -> str:
+    """The name of a sweep's folder, made on first use."""
+    path = root / HOLDER
+    if not path.exists():
+        root.mkdir(parents=True, exist_ok=True)
+        write_atomically(path, secrets.token_hex(6).encode())
+    return path.read_text()[:_ID_LENGTH]
+
+
 def _opened(run: Plan) -> str:
     """The cluster's id of the run in the run's folder; empty for none."""
     with contextlib.suppress(OSError, EvopolicyError):
@@ -299,7 +350,8 @@ async def facts_of(run: Plan, index: Index, operations: Operations) -> Facts:
         has_session = harness.continues or (
             harness.resumable and session.load(folder.session).session is not None
         )
-        return Facts(entry=entry, opened=True, phase=phase, has_session=has_session)
+        known: dict[str, Any] = {"phase": phase, "has_session": has_session}
+        return Facts(entry=entry, opened=True, closing=folder.closing.exists(), **known)
     intended = run.intended()
     settings = msgspec.structs.replace(run.settings, attempt=1 if entry is None else entry.attempt)
     return Facts(entry=entry, intended=intended is not None and intended.settings == settings)

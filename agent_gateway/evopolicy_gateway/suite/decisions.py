@@ -2,8 +2,8 @@
 
 - A finished run is kept. One that ended in an error, ours or its provider's, or was cancelled, is restarted as a new
   attempt.
-- A run that the cluster has closed is only finished. An open run resumes in its agent's session; without a session it
-  is restarted as a new attempt, and its files are kept aside.
+- A run that the cluster has closed, or whose agent has ended, is only finished. An open run resumes in its agent's
+  session; without a session it is restarted as a new attempt, and its files are kept aside.
 - If the file's settings differ from those that a run was played with, the operator decides.
 - Runs without common hidden cases are preferred for playing side by side. Runs with common ones wait for each other,
   because the agent of one may not share a machine with hidden episodes of the other.
@@ -48,7 +48,10 @@ class Facts(msgspec.Struct, frozen=True, kw_only=True):
     """Whether its folder holds no run but the request to open one with the run's settings, which may have been
     served."""
     phase: str | None = None
-    """That run's phase at the cluster; None when the cluster does not know it."""
+    """That run's phase at the cluster; None when the cluster does not know it: another one, or one on a backup from
+    before the run, which opens it again."""
+    closing: bool = False
+    """Whether that run's agent has ended and only the closing is left."""
     has_session: bool = False
     """Whether its agent can resume its session."""
 
@@ -90,9 +93,7 @@ def decide(run: Plan, facts: Facts, changed: Changed = "refuse") -> Decision:
         if entry is not None and entry.state in ("running", "error", "cancelled"):
             return decided("restart", "its folder is gone")
         return decided("new")
-    if facts.phase is None:
-        return decided("restart", "the cluster does not know it any more")
-    if facts.phase != "open":
+    if facts.closing or facts.phase not in ("open", None):
         return decided("finish")
     if facts.has_session:
         return decided("resume")

@@ -178,6 +178,8 @@ class Submit(FromGateway, frozen=True, kw_only=True, tag="submit"):
     """In the published profiles: the request takes an index, plays nothing, and has this verdict."""
     tree: Word = ""
     """Digest of the recorded workspace, from which other runs may start; empty: not recorded."""
+    after: Int = 0
+    """Number of submits that were accepted before; `unknown_submit` of a coordinator that has lost some."""
 
 
 class SubmitAccepted(Message, frozen=True, kw_only=True, tag="submit_accepted"):
@@ -254,6 +256,8 @@ class CloseRun(FromGateway, frozen=True, kw_only=True, tag="close_run"):
     """As `closed_reason` of `run.json` lists them."""
     agent: Plain = {}
     """The gateway's facts about the agent for `run.json`: turns, retries, tokens, version."""
+    after: Int = 0
+    """As in `Submit`."""
 
 
 class RunClosed(Message, frozen=True, kw_only=True, tag="run_closed"):

@@ -40,6 +40,8 @@ class CreateRun(FromOperator, frozen=True, kw_only=True, tag="create_run"):
     settings: RunSettings
     replay_key: Word = ""
     """With `settings.replay_of`: the key with which that run was created, which only its operator knows."""
+    run: Word = ""
+    """The run that was opened with the key before, to be opened again by a coordinator that has lost it; empty: new."""
 
 
 class RunCreated(Message, frozen=True, kw_only=True, tag="run_created"):
@@ -182,6 +184,8 @@ class PlayedAs(msgspec.Struct, frozen=True, kw_only=True):
     """With `submit`, `indexes` must cover the whole list."""
     observations: ObservationForm = "arrays"
     failed_episodes: FailedEpisodes = "play-on"
+    published: bool = False
+    """As in `Job`."""
     hidden_evaluation: HiddenEvaluation = "submit"
 
 
@@ -367,6 +371,10 @@ class ClaimState(Message, frozen=True, kw_only=True, tag="claim_state"):
     """The run that the last holder played for it; empty: none yet."""
     previous: Word = ""
     """The previous holder, if the claim has just been taken over because it expired."""
+    kept: bool = False
+    """Whether the requester held the claim before."""
+    coordinator: Word = ""
+    """The coordinator's process: another one may have been started on an earlier backup."""
     result: Plain | None = None
     """The run's result, once the claim is settled."""
 

@@ -150,11 +150,5 @@ class SetAside(Entry, frozen=True, kw_only=True, tag="set_aside"):
     message: str
 
 
-class Closed(Entry, frozen=True, kw_only=True, tag="closed"):
-    """The coordinator has recorded that no more submits come."""
-
-    reason: str
-
-
-AnyEntry = Requested | Accepted | Settled | Refused | Rejected | Died | SetAside | Closed
+AnyEntry = Requested | Accepted | Settled | Refused | Rejected | Died | SetAside
 entry_decoder = msgspec.json.Decoder(AnyEntry)

@@ -2,6 +2,8 @@
 
 Rules:
 - A claim has one holder until it expires, is given back, or is settled. A settled claim stays settled.
+- A host that has a result settles the claim, whoever holds it: a coordinator that was started on an earlier backup may
+  have granted it once more.
 - The holder and the result are on disk before the reply. The expiry time is not: after a restart every holder gets
   its full time again, so the coordinator's downtime costs no host its claim.
 - A holder that requests its claim again, also after its own restart, keeps it.
@@ -10,6 +12,7 @@ Rules:
 from __future__ import annotations
 
 import asyncio
+import secrets
 from typing import Any
 
 import msgspec
@@ -48,6 +51,7 @@ class Claims:
         self._until: dict[tuple[str, str], float] = {}
         """Expiry of each held claim, Unix seconds."""
         self._one_at_a_time = asyncio.Lock()
+        self._process = secrets.token_hex(8)
 
     async def ask(self, message: Claim, now: float) -> ClaimState:
         """Takes, renews, gives back or settles a claim.
@@ -59,8 +63,10 @@ class Claims:
             rows, key = await self._loaded(now), (message.suite, message.name)
             row = rows.get(key, _FREE)
             held = row.holder not in ("", message.holder) and self._until.get(key, 0.0) > now
-            if held or row.result is not None:
-                return ClaimState(granted=False, holder=row.holder, run=row.run, result=row.result)
+            kept = row.holder == message.holder
+            known: dict[str, Any] = {"run": row.run, "kept": kept, "coordinator": self._process}
+            if row.result is not None or (held and message.result is None):
+                return ClaimState(granted=False, holder=row.holder, result=row.result, **known)
             given_back = message.ttl_s <= 0.0 and message.result is None
             new = ClaimRow(
                 holder="" if given_back else message.holder,
@@ -76,9 +82,9 @@ class Claims:
             return ClaimState(
                 granted=not given_back,
                 holder=new.holder,
-                run=row.run,
-                previous=row.holder if row.holder != message.holder else "",
+                previous="" if kept else row.holder,
                 result=message.result,
+                **known,
             )
 
     async def _loaded(self, now: float) -> dict[tuple[str, str], ClaimRow]:

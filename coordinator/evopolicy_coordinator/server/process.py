@@ -23,6 +23,7 @@ from evopolicy_common.simulators import SIMULATORS
 from evopolicy_common.wire import credentials, transport
 from evopolicy_common.wire.credentials import Ready
 from evopolicy_coordinator.core.contract.settings import CoreSettings
+from evopolicy_coordinator.pki.identity import SIGNING_KEY
 from evopolicy_coordinator.pki.machines import Machines
 from evopolicy_coordinator.server.definitions import Definitions
 from evopolicy_coordinator.server.reader import ServiceReader
@@ -31,7 +32,7 @@ from evopolicy_coordinator.server.request_parser import RequestParser
 from evopolicy_coordinator.server.run_requests import RunRequests
 from evopolicy_coordinator.server.service import Service
 from evopolicy_coordinator.server.uploads import Uploads
-from evopolicy_coordinator.splits import SplitSource, secret_of
+from evopolicy_coordinator.splits import SplitSource, load_or_create_secret, secret_of
 from evopolicy_coordinator.storage.state_folder import ROLES, StateFolder, reachable, resolve_listen
 from evopolicy_coordinator.storage.store import Store
 from evopolicy_coordinator.worlds import JOURNAL
@@ -79,6 +80,9 @@ async def run(options: Options, stop: asyncio.Event, on_ready: Callable[[Ready],
         source = SplitSource(data=options.data, secret=secret, journal=state.root / JOURNAL)
         machines = Machines(state.root)
         listen, remote = _listen(state, options, machines)
+        load_or_create_secret(
+            state.root / SIGNING_KEY
+        )  # now, so that every backup has it: runs are named from it
         store = Store(state.database)
         opened.callback(store.close)
         (state.root / PROCESSES).unlink(missing_ok=True)

@@ -2,16 +2,20 @@
 
 Rules that this module owns:
 - Cases, secrets and the lineage of a run come from this coordinator, never from the request.
+- A run's name and secrets follow from its key and the coordinator's own: a run that is lost with the work since a
+  backup is opened again as the same run.
 - A replay has the cases and the secret of its run, and the run's key proves the right to it.
 - Everything here reads files: call it on a thread. A request that is refused here has changed nothing.
 """
 
 from __future__ import annotations
 
+import base64
 import contextlib
 import hmac
 import secrets
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 from msgspec.structs import replace
@@ -41,6 +45,7 @@ from evopolicy_coordinator.core.contract.events import (
 from evopolicy_coordinator.core.contract.reasons import because
 from evopolicy_coordinator.core.contract.records import EvaluationRow, RunRow, shared
 from evopolicy_coordinator.core.runs.templates import RANDOM
+from evopolicy_coordinator.pki.identity import of_run
 from evopolicy_coordinator.server.reader import ServiceReader
 from evopolicy_coordinator.server.reason_texts import words
 from evopolicy_coordinator.server.request_checks import (
@@ -91,7 +96,9 @@ class RunRequests:
         if isinstance(message, operator.CreateRun):
             # A run of another coordinator is played again as any run, with this one's cases and a new secret.
             of = self._reader.replayed(message.settings.replay_of)
-            return RunCreated(**about, row=self._run(message) if of is None else _replay(message, of))
+            row = self._run(message) if of is None else self._replay(message, of)
+            require(message.run in ("", row.run), Refusal.UNKNOWN_RUN, f"unknown run {message.run[:64]!r}")
+            return RunCreated(**about, row=row)
         if isinstance(message, operator.Rescore):
             of_run = self._reader.finished_with_result(message.run)
             return EvaluationRequested(**about, row=self.rescore(message, *of_run))
@@ -128,9 +135,9 @@ class RunRequests:
                 largest = max(most, len(cases.validation), len(cases.heldout))
             check_job((*cases.train, *hidden), largest)
         return RunRow(
-            **_new_secrets(),
+            **self._own(m.key, cases.epoch),
             key=m.key,
-            secret=secrets.token_bytes(32),
+            secret=run_secret(self._reader.state, m.key),
             settings=wanted,
             budget=budget,
             min_episodes_per_submit=least,
@@ -146,6 +153,32 @@ class RunRequests:
             max_steps=_max_steps(wanted.env, wanted.step_limit),
             related=tuple(case for case in related if case not in hidden),
         )
+
+    def _replay(self, m: operator.CreateRun, of: RunRow) -> RunRow:
+        """The row of a replay of the finished run `of`, with its cases and its secret."""
+        if not hmac.compare_digest(m.replay_key.encode(), of.key.encode()):
+            raise RefusedError(
+                Refusal.BAD_REQUEST,
+                f"run {of.run} is another operator's, or its .replay.json is lost or changed: only the operator"
+                " that opened a run replays it with its cases",
+            )
+        wanted, known = m.settings, of.settings
+        if wanted.start is not None and known.start is not None:
+            wanted = replace(wanted, start=replace(wanted.start, parent_scored=known.start.parent_scored))
+        same = replace(known, replay_of=of.run, notes=wanted.notes)
+        names = [each for each in wanted.__struct_fields__ if getattr(wanted, each) != getattr(same, each)]
+        if names:
+            raise ConfigError(f"a replay of run {of.run} has other settings than the run: {', '.join(names)}")
+        return replace(of, key=m.key, settings=wanted, committed=None, **self._own(m.key, of.epoch))
+
+    def _own(self, key: str, epoch: str) -> dict[str, Any]:
+        """The name and the secrets that every run has of its own, a replay too. With other cases it is another run."""
+        state = self._reader.state
+        return {
+            "run": f"r-{of_run(state, f'name|{epoch}', key)[:8].hex()}",
+            "capability": base64.urlsafe_b64encode(of_run(state, "capability", key)).decode().rstrip("="),
+            "salt": of_run(state, "salt", key)[:SALT_BYTES],
+        }
 
     def _evaluation(self, m: operator.Evaluate) -> EvaluationRow:
         # The finished run whose episodes are replayed supplies the policy seeds, and the cases if they came from
@@ -223,6 +256,7 @@ class RunRequests:
             policy_scope="episode" if is_random else settings.policy_scope,
             observations="arrays" if is_random else settings.observations,
             failed_episodes=settings.failed_episodes,
+            published=settings.profile != "own",
             hidden_evaluation=settings.hidden_evaluation,
         )
         if place.policy_scope == "submit" and m.indexes != tuple(range(n)):
@@ -311,36 +345,14 @@ def _started(reader: ServiceReader, wanted: RunSettings) -> tuple[RunSettings, t
     return replace(wanted, start=replace(start, parent_scored=scored)), related
 
 
-def _replay(m: operator.CreateRun, of: RunRow) -> RunRow:
-    """The row of a replay of the finished run `of`, with its cases and its secret."""
-    if not hmac.compare_digest(m.replay_key.encode(), of.key.encode()):
-        raise RefusedError(
-            Refusal.BAD_REQUEST,
-            f"run {of.run} is another operator's, or its .replay.json is lost or changed: only the operator"
-            " that opened a run replays it with its cases",
-        )
-    wanted, known = m.settings, of.settings
-    if wanted.start is not None and known.start is not None:
-        wanted = replace(wanted, start=replace(wanted.start, parent_scored=known.start.parent_scored))
-    same = replace(known, replay_of=of.run, notes=wanted.notes)
-    names = [each for each in wanted.__struct_fields__ if getattr(wanted, each) != getattr(same, each)]
-    if names:
-        raise ConfigError(f"a replay of run {of.run} has other settings than the run: {', '.join(names)}")
-    return replace(of, key=m.key, settings=wanted, committed=None, **_new_secrets())
-
-
 def _has_derived_cases(run: RunRow | None) -> bool:
     """Whether a run's cases came from a secret; its coordinator may have another one now (`splits.secret_of`)."""
     return run is not None and run.split_hashes.keys() == set(SPLITS)
 
 
-def _new_secrets() -> dict[str, Any]:
-    """The name and the secrets that every run has of its own, a replay too."""
-    return {
-        "run": f"r-{secrets.token_hex(8)}",
-        "capability": secrets.token_urlsafe(32),
-        "salt": secrets.token_bytes(SALT_BYTES),
-    }
+def run_secret(state: Path, key: str) -> bytes:
+    """What the random numbers of a run's policies follow from."""
+    return of_run(state, "secret", key)
 
 
 def _max_steps(env: str, step_limit: StepLimit) -> int:

@@ -9,6 +9,7 @@ from collections.abc import AsyncIterator, Awaitable, Callable
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import pytest
 from rigs.finished_run import finished, plan_in
 
@@ -45,6 +46,9 @@ class Cluster:
         self.reports: list[tuple[str, str, dict[str, Any] | None]] = []
         """Run's name, the cluster's id of it, and its result, as claims told them."""
         self.cancelled: list[str] = []
+        self.ended: list[str] = []
+        """Finished runs of which the cluster was asked to keep nothing open."""
+        self.phase: str | None = "open"
         self.answer: Callable[[str], ClaimState | None] = lambda name: None
 
     async def claim(
@@ -59,6 +63,12 @@ class Cluster:
 
     async def drop(self, folder: RunFolder) -> None:
         pass
+
+    async def phase_of(self, folder: RunFolder) -> str | None:
+        return self.phase
+
+    async def end_lost(self, run: str) -> None:
+        self.ended.append(run)
 
 
 def record_of(plan: Plan) -> RunRecord:
@@ -107,6 +117,7 @@ class Stage:
         self.view = SuiteView([run.name for run in self.runs], 2)
         self.events: list[str] = []
         self.view.event = lambda kind, run, **more: self.events.append(f"{kind} {run} {more}")  # type: ignore[method-assign]
+        self.facts: Facts | None = None
         self.begun: list[str] = []
         self.going: set[str] = set()
         self.most: set[frozenset[str]] = set()
@@ -159,7 +170,9 @@ class Stage:
             ),
             self.view,
         )
-        decided = [decide(run, Facts(entry=self.index.runs.get(run.name))) for run in self.runs]
+        facts = self.facts or Facts()
+        known = [msgspec.structs.replace(facts, entry=self.index.runs.get(run.name)) for run in self.runs]
+        decided = [decide(run, each) for run, each in zip(self.runs, known, strict=True)]
 
         async def main() -> None:
             async with asyncio.timeout(TIMEOUT_S):

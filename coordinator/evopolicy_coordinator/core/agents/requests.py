@@ -36,6 +36,12 @@ def known(state: State, name: str) -> Run | None:
     return state.runs.get(name)
 
 
+def check_whole(run: Run, n_submits: int) -> None:
+    """Raises NotDoneError (UNKNOWN_SUBMIT) when a gateway knows of more accepted submits: this is an earlier backup."""
+    if n_submits > len(run.submits):
+        raise NotDoneError("unknown_submit", run=run.id, n=len(run.submits), submit=n_submits - 1)
+
+
 def over(state: State, name: str) -> Reason:
     """Returns why a run that is not open refuses requests."""
     last = state.finished.get(name)

@@ -96,6 +96,8 @@ def close(state: State, event: events.Requested[gateway.CloseRun], step: Step) -
     close changes nothing."""
     message = event.message
     run = requests.known(state, message.run)
+    if run is not None and run.state.phase == "open":
+        requests.check_whole(run, message.after)
     permits.end(state, message.run, step, "its run was closed")
     permits.drop_asks(state, message.run, because("run_closed", run=message.run), step)
     if run is not None and run.state.phase == "open":

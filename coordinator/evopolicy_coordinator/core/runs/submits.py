@@ -44,6 +44,7 @@ def submit(state: State, event: events.Requested[gateway.Submit], step: Step) ->
         return
     if run.state.phase != "open":
         raise NotDoneError(requests.over(state, run.id))
+    requests.check_whole(run, message.after)
     if run.open is not None:
         raise NotDoneError("busy", submit=run.open)
     if message.rejected is not None and run.row.settings.profile != "own":

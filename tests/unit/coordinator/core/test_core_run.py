@@ -51,3 +51,21 @@ def test_a_request_of_an_unknown_run_is_refused(rig: Rig) -> None:
     for answer in (rig.submit(0), rig.results(), rig.close(), rig.ask(gateway.StateRequest, run="r1")):
         assert isinstance(answer, Refused)
         assert answer.status == "unknown_run"
+
+
+def test_a_gateway_that_knows_more_submits_is_told_so(rig: Rig) -> None:
+    """As of a coordinator on a backup from before these submits."""
+    session = rig.register()
+    rig.create()
+    for ask in (
+        lambda: rig.submit(0, key="k1", after=1),
+        lambda: rig.ask(gateway.CloseRun, run="r1", reason="agent_stopped", after=1),
+    ):
+        answer = ask()
+        assert isinstance(answer, Refused)
+        assert answer.status == "unknown_submit"
+    assert rig.submit(0, key="k0") == gateway.SubmitAccepted(
+        submit_index=0, first_global_episode=0, remaining_budget=15
+    )
+    rig.work_off(session, lambda job: 1.0)
+    assert rig.ask(gateway.CloseRun, run="r1", reason="agent_stopped", after=1) == gateway.RunClosed()

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from evopolicy_common.errors import RefusedError
-from evopolicy_common.messages.operator import Claim, ClaimState
+from evopolicy_common.messages.operator import Claim
 from evopolicy_coordinator.server.claims import Claims
 from evopolicy_coordinator.storage.store import Store
 from evopolicy_coordinator.storage.writer import Writer
@@ -37,8 +37,9 @@ def test_a_held_claim_is_exclusive_until_its_time_is_up(tmp_path: Path) -> None:
     async def work(claims: Claims) -> None:
         assert (await claims.ask(claim("one"), 0.0)).granted
         refused = await claims.ask(claim("two"), 59.0)
-        assert refused == ClaimState(granted=False, holder="one", run="")
-        assert (await claims.ask(claim("one", run="r-1"), 59.0)).granted
+        assert (refused.granted, refused.holder, refused.run, refused.kept) == (False, "one", "", False)
+        again = await claims.ask(claim("one", run="r-1"), 59.0)
+        assert (again.granted, again.kept) == (True, True)
         assert not (await claims.ask(claim("two"), 118.0)).granted
         taken = await claims.ask(claim("two"), 120.0)
         assert (taken.granted, taken.previous, taken.run) == (True, "one", "r-1")
@@ -52,6 +53,18 @@ def test_a_settled_claim_is_settled_for_good(tmp_path: Path) -> None:
         await claims.ask(claim("one"), 0.0)
         await claims.ask(claim("one", result={"status": "completed"}), 1.0)
         late = await claims.ask(claim("two"), 1e6)
+        assert (late.granted, late.holder, late.result) == (False, "one", {"status": "completed"})
+
+    with_claims(tmp_path, work)
+
+
+def test_a_result_settles_a_claim_that_another_host_holds(tmp_path: Path) -> None:
+    async def work(claims: Claims) -> None:
+        # As of a coordinator on a backup from before the run: it grants the finished run once more.
+        began = await claims.ask(claim("two", run="r-2"), 0.0)
+        offered = await claims.ask(claim("one", result={"status": "completed"}), 1.0)
+        assert (offered.granted, offered.run, offered.coordinator) == (True, "r-2", began.coordinator)
+        late = await claims.ask(claim("two", run="r-2"), 2.0)
         assert (late.granted, late.holder, late.result) == (False, "one", {"status": "completed"})
 
     with_claims(tmp_path, work)

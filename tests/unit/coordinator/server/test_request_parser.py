@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 from typing import Any, get_args
 
@@ -120,7 +121,7 @@ def test_run_takes_its_numbers_and_cases_from_its_suite(parser: RequestParser) -
     assert len(made.row.secret) == 32
     assert keys.valid_name(made.row.run)
     assert (made.row.allowed_imports, made.row.denied_imports) == (("numpy",), ("gymnasium",))
-    other = event(parser, OPS, create())
+    other = event(parser, OPS, msgspec.structs.replace(create(), key="k2"))
     assert (other.row.train, other.row.split_hashes) == (made.row.train, made.row.split_hashes)
     assert made.row.run != other.row.run
     assert made.row.capability != other.row.capability
@@ -515,3 +516,22 @@ def test_a_rescore_by_policies_of_whole_submits_plays_all_cases_at_once(
 def test_every_kind_of_request_has_one_row() -> None:
     unions = (worker.WorkerRequest, gateway.GatewayRequest, operator.OperatorRequest)
     assert REQUESTS.keys() == {kind for union in unions for kind in get_args(union)}
+
+
+def test_a_lost_run_is_opened_again_as_the_same_run(tmp_path: Path) -> None:
+    def opened(state: Path, message: operator.CreateRun) -> Any:
+        state.mkdir(exist_ok=True)
+        return event(make_parser(state), OPS, message).row
+
+    state, restored, other = (tmp_path / name for name in ("state", "restored", "other"))
+    row = opened(state, create())
+    shutil.copytree(state, restored)
+    again = opened(restored, msgspec.structs.replace(create(), run=row.run))
+    assert again == row
+    assert opened(state, msgspec.structs.replace(create(), key="k2")).run != row.run
+    stranger = opened(other, create())
+    assert {row.run, row.capability, row.salt, row.secret}.isdisjoint(
+        {stranger.run, stranger.capability, stranger.salt, stranger.secret}
+    )
+    asked = msgspec.structs.replace(create(), run=row.run)
+    assert refused(make_parser(other), OPS, asked).status == "unknown_run"

@@ -13,7 +13,6 @@ from evopolicy_common.errors import ConfigError, StorageError
 from evopolicy_common.records.open_run import (
     Accepted,
     AnyEntry,
-    Closed,
     OpenedRun,
     Rejected,
     Requested,
@@ -30,7 +29,6 @@ ENTRIES: list[AnyEntry] = [
     Accepted(key="k", submit_index=0, first_global_episode=0, remaining_budget=3),
     Settled(key="k", status="ok", summary='{\n  "a": "é\u2028"\n}\n'),
     Rejected(status="budget_invalid", message="no", at=1.5, after_submits=1),
-    Closed(reason="budget_spent"),
 ]
 
 

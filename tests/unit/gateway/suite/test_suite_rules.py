@@ -198,7 +198,11 @@ def test_the_facts_about_a_run_decide_its_start(tmp_path: Path) -> None:
         (Facts(opened=True, phase="open", has_session=True, entry=running), "resume", 1),
         (Facts(opened=True, phase="open", has_session=False, entry=running), "restart", 2),
         (Facts(opened=True, phase="heldout", has_session=False, entry=running), "finish", 1),
-        (Facts(opened=True, phase=None, has_session=True, entry=running), "restart", 2),
+        # The cluster may have lost it, and opens it again; an agent that has ended is never started again.
+        (Facts(opened=True, phase=None, has_session=True, entry=running), "resume", 1),
+        (Facts(opened=True, phase=None, entry=running), "restart", 2),
+        (Facts(opened=True, phase=None, closing=True, entry=running), "finish", 1),
+        (Facts(opened=True, phase="open", has_session=True, closing=True, entry=running), "finish", 1),
         (Facts(entry=running), "restart", 2),
         (Facts(entry=running, intended=True), "resume", 1),
     ]

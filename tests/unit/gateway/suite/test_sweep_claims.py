@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from pathlib import Path
 
 import msgspec
 import pytest
@@ -12,7 +13,7 @@ from evopolicy_common.errors import EvopolicyError
 from evopolicy_common.messages.operator import ClaimState
 from evopolicy_common.records.open_run import OpenedRun
 from evopolicy_gateway.run_folder.layout import save
-from evopolicy_gateway.suite import sweep
+from evopolicy_gateway.suite import claimed, sweep
 from evopolicy_gateway.suite.decisions import Decision, Facts, decide
 
 
@@ -146,3 +147,56 @@ def test_a_sweep_that_renews_no_claims_ends_with_the_reason(staged: Staged) -> N
     with pytest.raises(LookupError, match="a bug"):
         stage.play()
     assert not stage.going
+
+
+def test_an_open_run_that_the_cluster_cannot_open_again_is_attempted_anew(staged: Staged) -> None:
+    for phase, attempt in (("open", 1), (None, 2)):
+        stage = staged(EVOLVE.format("a"))
+        run = stage.runs[0]
+        run.folder.state.mkdir(parents=True, exist_ok=True)
+        save(run.folder.opened_run, OpenedRun(run="r-7", agents_md=""))
+        stage.cluster.phase = phase
+        stage.facts = Facts(opened=True, phase=None, closing=True)
+        stage.play()
+        assert stage.attempts == {run.name: attempt}
+
+
+def test_a_claim_that_this_host_kept_is_no_reason_to_begin_anew(staged: Staged) -> None:
+    stage = staged(EVOLVE.format("a"))
+    run = stage.runs[0]
+    run.folder.state.mkdir(parents=True)
+    save(run.folder.opened_run, OpenedRun(run="r-8", agents_md=""))
+    # As of a backup from before the run's second attempt.
+    stage.cluster.answer = lambda _: ClaimState(granted=True, holder="me", run="r-7", kept=True)
+    stage.facts = Facts(opened=True, phase="open", closing=True)
+    stage.play()
+    assert stage.cluster.cancelled == ["r-7"]
+    assert stage.attempts == {run.name: 1}
+
+
+def test_results_are_told_again_to_another_coordinator_process(staged: Staged) -> None:
+    stage = staged("[parallel]\nmachine = 1\n" + EVOLVE.format("a") + EVOLVE.format("b"))
+    first, second = (run.name for run in stage.runs)
+    process = ["one"]
+    stage.cluster.answer = lambda _: ClaimState(
+        granted=True, holder="me", run="", coordinator=process[0], kept=True
+    )
+
+    async def act(name: str) -> None:
+        if name == second:
+            told = len([one for one in stage.cluster.reports if one[0] == first and one[2]])
+            process[0] = "two"
+            await until(lambda: len([o for o in stage.cluster.reports if o[0] == first and o[2]]) > told)
+
+    stage.act = act
+    index = stage.play()
+    assert stage.cluster.ended == [index.runs[first].run]
+
+
+def test_folders_of_one_path_on_machines_of_one_name_are_two_hosts(tmp_path: Path) -> None:
+    names = []
+    for machine in ("one", "other"):
+        root = tmp_path / machine
+        names.append(claimed._id_of(root))
+        assert claimed._id_of(root) == names[-1]
+    assert len(set(names)) == 2
