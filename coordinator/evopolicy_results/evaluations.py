@@ -114,6 +114,7 @@ class Evaluations:
                 # Random actions had no policy that could receive lists, and are recorded as arrays.
                 observations="arrays" if is_random else conditions.observations,
                 failed_episodes=conditions.failed_episodes,
+                published=conditions.profile != "own",
                 hidden_evaluation=conditions.hidden_evaluation,
             ),
         )

@@ -8,6 +8,7 @@ from typing import Any
 
 import msgspec
 
+from evopolicy_common import published_forms
 from evopolicy_common.messages.gateway import RunState
 from evopolicy_common.records.run_record import PROTOCOL_VERSION
 from evopolicy_gateway.submits.tickets import Ticket, TicketMachine
@@ -24,7 +25,9 @@ def info_document(machine: TicketMachine, left: Mapping[str, Any] | None = None)
     env_meta = {name: getattr(env, name) for name in ("env", "env_version")}
     env_meta |= {"n_env_instances": run.n_env_instances, "max_episode_steps": run.announced_steps}
     env_meta |= {name: getattr(env, name) for name in ("obs_space", "action_space", "obs_storage")}
-    if names := env.reward_components:
+    if run.profile != "own":
+        env_meta |= published_forms.described(env.obs_space, env.action_space, env.obs_storage)
+    elif names := env.reward_components:
         env_meta["reward_components"] = {name: env.reward_texts.get(name, "") for name in names}
     rollout_wall_s = min(run.limits.episode_wall_s, run.limits.submit_wall_s or math.inf)
     return {

@@ -6,7 +6,8 @@ errors), since a policy could write its observations there.
 In the published profiles, observations are where the published software (v0.1.0) has them. Where the stacked ones of an
 episode take more than `MOST_INLINE_BYTES`, they are in `observations.npy`, or in `observations.npz` for flat
 dictionaries, whose arrays are summed, and every row has `obs: null`; otherwise they are in the rows. Whole numbers that
-are all within 0 to 255 are stacked as uint8. Observations that do not stack (ragged ones, texts) stay in the rows.
+are all within 0 to 255 are stacked as uint8, the texts of a dictionary as they are. Observations that do not stack
+(ragged ones, texts by themselves) stay in the rows.
 """
 
 from __future__ import annotations
@@ -168,14 +169,15 @@ def _columns(obs: list[Any]) -> dict[str, np.ndarray[Any, Any]]:
     """The stacked observations by name; empty if they do not stack."""
     if not obs:
         return {}
-    parts = {SINGLE: obs}
+    parts, kinds = {SINGLE: obs}, "biuf"
     if isinstance(obs[0], dict):
+        kinds += "U"
         parts = {name: [each[name] for each in obs] for name in obs[0]}
     try:
         columns = {name: np.array(part) for name, part in parts.items()}
     except ValueError:
         return {}
-    return columns if all(column.dtype.kind in "biuf" for column in columns.values()) else {}
+    return columns if all(column.dtype.kind in kinds for column in columns.values()) else {}
 
 
 def _small(column: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:

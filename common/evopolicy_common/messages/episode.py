@@ -138,6 +138,8 @@ class Job(msgspec.Struct, frozen=True, kw_only=True):
     max_steps: Int = 0
     """An episode is cut after this many steps; 0: only its environment ends it."""
     failed_episodes: FailedEpisodes = "play-on"
+    published: bool = False
+    """Of a run in a published profile: actions are read, and spaces described, as the published software does."""
     begun: BlobRef | None = None
     """The policy's actions of an earlier attempt, which remain valid (`JobResult.begun`); None for a first attempt."""
     environment_faults: Int = 0

@@ -61,7 +61,7 @@ from evopolicy_common.records.episodes.trajectory import Recorder, decode
 from evopolicy_common.wire import codec
 from evopolicy_worker import environments
 from evopolicy_worker.environments import Environment
-from evopolicy_worker.environments.interface.actions import ActionCodec
+from evopolicy_worker.environments.interface.actions import ActionCodec, compile_actions
 from evopolicy_worker.environments.interface.base import Observation, Step
 from evopolicy_worker.environments.interface.calls import described, note
 from evopolicy_worker.environments.interface.trial import solved
@@ -306,6 +306,8 @@ class _Episode:
     def _source(self, policy: PolicyProcess | None, recorded: list[Returned] | None = None) -> Source:
         """The policy's actions, the recorded ones, or random ones after those that a policy has returned."""
         codec, begun = self.environment.action_codec, self.begun
+        if self.job.published:
+            codec = compile_actions(self.environment.description.action_space, published=True)
         if policy is not None:
             return _asked(codec, policy, begun)
         if recorded is not None:

@@ -14,6 +14,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
+from evopolicy_common import published_forms
 from evopolicy_common.errors import EvopolicyError
 from evopolicy_common.messages.episode import EpisodeSpec, Job, PolicyFailure
 from evopolicy_common.processes.scratch import remove_tree
@@ -103,7 +104,11 @@ class Policies:
             "action_space": description.action_space,
             "obs_storage": description.obs_storage,
         }
-        if description.reward_components:
+        self._spaces = description.obs_space, description.action_space
+        if job.published:
+            self._env_meta |= published_forms.described(*self._spaces, description.obs_storage)
+            self._env_meta.pop("artifacts", None)
+        elif description.reward_components:
             self._env_meta["reward_components"] = dict(description.reward_texts)
 
     def take(self, k: int, spec: EpisodeSpec) -> PolicyProcess:
@@ -122,7 +127,7 @@ class Policies:
         # Where policies have the same folder, whose path is in their code.
         code = self._code(files.data[slice(*places["policy.py"])]) if self._jail.home is not None else b""
         policy = self._policy = self._start()
-        policy.seal(files, spec.policy_seed, self._env_meta, job.observations)
+        policy.seal(files, spec.policy_seed, self._env_meta, job.observations, self._spaces)
         policy.load(code)
         return policy
 

@@ -159,10 +159,19 @@ class PolicyProcess:
         self._watch.spent_s = 0.0
         self._request(player.LOAD, "init", self._limits.init_wall_s, 0, code)
 
-    def seal(self, bundle: messages.Files, seed: bytes, env_meta: dict[str, Any], observations: str) -> None:
-        """Gives the process its bundle and its limits, and takes its rights away."""
+    def seal(
+        self,
+        bundle: messages.Files,
+        seed: bytes,
+        env_meta: dict[str, Any],
+        observations: str,
+        spaces: tuple[Any, Any] | None = None,
+    ) -> None:
+        """Gives the process its bundle and its limits, and takes its rights away. `spaces`: of observations and actions
+        where `env_meta` describes them in another form."""
         limits = self._limits
-        needed = 16 * frames.elements(env_meta["action_space"])
+        obs_space, action_space = spaces or (env_meta["obs_space"], env_meta["action_space"])
+        needed = 16 * frames.elements(action_space)
         self._action_bytes = limits.action_bytes + needed
         self._usual_bytes = _USUAL_ACTION_BYTES + needed
         n_folders = len({name.rpartition("/")[0] for name, _, _ in bundle.names}) * 16
@@ -185,13 +194,14 @@ class PolicyProcess:
             "files": bundle.names,
             "limits": rlimits,
             "seed": seed.hex(),
+            "observed": obs_space,
             "obs_space": env_meta["obs_space"],
             "action_space": env_meta["action_space"],
             "env_meta": env_meta,
             "observations": observations,
             "action_bytes": self._action_bytes,
         }
-        self._write = frames.compile_writer(env_meta["obs_space"])
+        self._write = frames.compile_writer(obs_space)
         self._monitor.watch(self._watch)
         head = json.dumps(init).encode()
         self._request(player.INIT, "seal", _SEAL_S, len(head), head, bundle.data)

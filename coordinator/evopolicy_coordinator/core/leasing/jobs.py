@@ -70,6 +70,7 @@ def build(job: JobState, description: EnvironmentDescription) -> Job:
         limits=template.limits,
         max_steps=template.max_steps,
         failed_episodes=template.failed_episodes,
+        published=template.published,
         begun=job.begun,
         environment_faults=job.faults.n,
     )

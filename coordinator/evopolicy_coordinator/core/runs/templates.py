@@ -192,7 +192,8 @@ def _conditions(owner: Run | Evaluation) -> dict[str, Any]:
     else:
         how, tier, limits = _place(row), row.tier, row.limits
     shared = {"observations": how.observations, "failed_episodes": how.failed_episodes}
-    return {**shared, "tier": tier, "limits": limits}
+    published = how.published if isinstance(how, PlayedAs) else how.profile != "own"
+    return {**shared, "published": published, "tier": tier, "limits": limits}
 
 
 def env_meta(run: Run, row: SubmitRow) -> dict[str, object]:

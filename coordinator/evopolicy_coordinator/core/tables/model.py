@@ -118,6 +118,7 @@ class Template:
     max_steps: int
     """As in `Job`."""
     failed_episodes: FailedEpisodes = "play-on"
+    published: bool = False
     replays: tuple[BlobRef, ...] = ()
     """Recorded actions for each index, in place of a policy; empty for none."""
     indexes: tuple[int, ...] = ()

@@ -109,6 +109,36 @@ REPAIRED: list[tuple[SpaceSchema, Any, Any, bool]] = [
 ]
 
 
+PUBLISHED: list[tuple[SpaceSchema, Any, Any, bool]] = [
+    *((FOUR, raw, 3, False) for raw in (3, 3.7, np.float32(3.7), np.int64(3), np.array(3), "3")),
+    *((FOUR, raw, 0, False) for raw in (0.6, -0.4, False)),
+    *(
+        (FOUR, raw, 0, True)
+        for raw in ([3], [[3]], (3,), np.array([3]), np.array([[3]]), None, "x", "3.7", {})
+    ),
+    *((FOUR, raw, 0, True) for raw in (float("nan"), float("inf"), np.float32("nan"), -1.0)),
+    (FOUR, 4.2, 3, True),
+    (NARROW, "0.05", [0.05], False),
+    (NARROW, ["0.05"], [0.05], False),
+    (NARROW, "1", [0.1], True),
+    (BOX, ["0.5", 0.25, "1"], VECTOR, False),
+    *((BOX, raw, ZERO, True) for raw in ("x", ["x", 0, 0], {}, None, [0.1, 0.2])),
+    *((BOX, raw, VECTOR, False) for raw in VECTORS),
+]
+
+
+@pytest.mark.parametrize(("space", "raw", "expected", "marked"), PUBLISHED)
+def test_the_published_profiles_read_actions_as_the_published_software(
+    space: SpaceSchema, raw: object, expected: Any, marked: bool
+) -> None:
+    codec = compile_actions(space, published=True)
+    action, invalid = codec.repair(raw)
+    assert invalid == marked
+    np.testing.assert_array_equal(action, np.array(expected, dtype=space.get("dtype")))
+    same_as_ours = compile_actions(space).sample(np.random.default_rng(1))
+    np.testing.assert_array_equal(codec.sample(np.random.default_rng(1)), same_as_ours)
+
+
 @pytest.mark.parametrize(("space", "raw", "expected", "marked"), REPAIRED)
 def test_an_action_is_taken_as_it_is_meant_or_repaired_and_marked(
     space: SpaceSchema, raw: object, expected: Any, marked: bool

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 import textwrap
 
 import pytest
@@ -108,6 +109,30 @@ def test_a_fault_in_make_policy_is_an_init_error(slots: Slots) -> None:
     assert (without.failure.category, "act" in without.failure.message) == ("init_error", True)
     helper = slots.play(EARLIER.replace("import numpy as np", "def make_policy(context): raise ValueError"))
     assert helper.failure is None
+
+
+def test_a_missing_environment_parameter_is_named(slots: Slots) -> None:
+    policy = "def make_policy(context):\n    return context.environment_parameters['gravity']\n"
+    failed = slots.play(policy, first=0)
+    assert category_of(failed) == "init_error"
+    assert failed.failure is not None
+    assert "there is no environment parameter 'gravity'" in failed.failure.message
+    assert "Gymnasium's defaults" in failed.failure.message
+
+
+@pytest.mark.skipif(
+    sys.version_info >= (3, 12), reason="Python 3.12 reads it: play the tests with an earlier one"
+)
+@pytest.mark.parametrize("line", ["type Number = float", "from typing import override"])
+def test_code_for_a_newer_python_names_the_workers(slots: Slots, line: str) -> None:
+    failed = slots.play(f"{line}\n{textwrap.dedent(NEWEST)}", first=0)
+    assert failed.failure is not None
+    assert failed.failure.category == "import_error"
+    own = f"this worker has Python {sys.version_info[0]}.{sys.version_info[1]}"
+    assert failed.failure.message.endswith(f"({own}; policies of this form are written for Python 3.12)")
+    earlier = slots.play(f"{line}\n{EARLIER}", first=0)
+    assert earlier.failure is not None
+    assert "3.12" not in earlier.failure.message
 
 
 def test_a_bundles_own_module_of_that_name_comes_first(slots: Slots) -> None:

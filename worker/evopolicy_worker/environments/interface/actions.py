@@ -12,13 +12,16 @@ Works from the schema of the action space alone, compiled once: `repair` runs on
   of that part; and anything that is no number at all (None, strings, ragged lists, objects) the neutral value of the
   space.
 - The neutral value of a Box is zero, or the bound nearest to it; that of the discrete spaces is the lowest one.
+- In the published profiles, actions are read as the published software reads them: a choice is the integer part of a
+  number, or of a text that is an integer, and a list or array of one is none; texts that are numbers count in a Box.
 - What is returned is fresh, of exactly the dtype and shape of the space, and finite.
 """
 
 from __future__ import annotations
 
+import contextlib
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -53,9 +56,10 @@ class ActionCodec(ABC):
         return self.repair(None)[0]
 
 
-def compile_actions(schema: SpaceSchema) -> ActionCodec:
-    """The codec of an action space. TypeError for an unknown kind of space."""
-    codec = _CODECS.get(schema["type"])
+def compile_actions(schema: SpaceSchema, *, published: bool = False) -> ActionCodec:
+    """The codec of an action space. `published`: reads actions as the published software does. TypeError for an unknown
+    kind of space."""
+    codec = (_CODECS | _PUBLISHED if published else _CODECS).get(schema["type"])
     if codec is None:
         raise TypeError(f"no actions for a space of type {schema['type']!r}")
     return codec(schema)
@@ -76,6 +80,16 @@ class _Discrete(ActionCodec):
 
     def sample(self, rng: np.random.Generator) -> int:
         return self._low + int(rng.integers(self._n))
+
+
+class _PublishedDiscrete(_Discrete):
+    def repair(self, raw: object) -> tuple[int, bool]:
+        if isinstance(raw, np.ndarray | np.generic):
+            raw = raw.tolist()
+        try:
+            return super().repair(int(raw)) if isinstance(raw, int | float | str) else (self._low, True)
+        except (ValueError, OverflowError):
+            return self._low, True
 
 
 class _Box(ActionCodec):
@@ -113,7 +127,7 @@ class _Box(ActionCodec):
             return self._repair_any(raw)
 
     def _repair_any(self, raw: object) -> tuple[NDArray[Any], bool]:
-        shaped, invalid = _shaped(_numbers(raw), self._shape)
+        shaped, invalid = _shaped(self._read(raw), self._shape)
         if shaped is None:
             return self._cast(self._neutral), True
         values = shaped.astype(np.float64)
@@ -145,9 +159,21 @@ class _Box(ActionCodec):
             values = np.minimum(np.maximum(np.floor(values), self._clip_low), self._clip_high)
         return self._cast(values)
 
+    def _read(self, raw: object) -> NDArray[Any] | None:
+        return _numbers(raw)
+
     def _cast(self, values: Any) -> NDArray[Any]:
         """A fresh array of the space's dtype; numpy makes scalars of arrays without axes."""
         return np.asarray(values).astype(self._dtype)
+
+
+class _PublishedBox(_Box):
+    def _read(self, raw: object) -> NDArray[Any] | None:
+        found = _numbers(raw)
+        if found is None and isinstance(raw, str | list | tuple | np.ndarray):
+            with contextlib.suppress(ValueError, TypeError, OverflowError, RecursionError):
+                return np.asarray(raw, dtype=np.float64)
+        return found
 
 
 class _MultiDiscrete(ActionCodec):
@@ -327,7 +353,7 @@ class _Graph(ActionCodec):
         return GraphInstance(nodes, edges, links)
 
 
-_CODECS: Mapping[str, Callable[[SpaceSchema], ActionCodec]] = {
+_CODECS: dict[str, Callable[[SpaceSchema], ActionCodec]] = {
     "Discrete": _Discrete,
     "Box": _Box,
     "Image": _Box,
@@ -340,6 +366,12 @@ _CODECS: Mapping[str, Callable[[SpaceSchema], ActionCodec]] = {
     "OneOf": _OneOf,
     "Graph": _Graph,
 }
+_PUBLISHED: dict[str, Callable[[SpaceSchema], ActionCodec]] = {
+    "Discrete": _PublishedDiscrete,
+    "Box": _PublishedBox,
+    "Image": _PublishedBox,
+}
+"""Those of the published profiles that differ."""
 
 
 def _listed(raw: object) -> Any:

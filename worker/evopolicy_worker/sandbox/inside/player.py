@@ -91,7 +91,7 @@ def play(init: dict[str, Any]) -> NoReturn:
     code = bytearray(length)
     read_exactly(code)
     # Before the policy can change the spaces, which are its own.
-    reader = observation_reader(init["obs_space"], init["observations"] == "lists")
+    reader = observation_reader(init["observed"], init["observations"] == "lists")
     stage = "import"
     try:
         module = imported_policy(path, code)
@@ -105,7 +105,10 @@ def play(init: dict[str, Any]) -> NoReturn:
         else:
             policy = module.Policy(*spaces, init["env_meta"])
     except BaseException as error:
-        reply_failure(stage, error)
+        remark = ""
+        with contextlib.suppress(BaseException):  # of a hostile exception, or without a file
+            remark = programs.needs_newer(error, source_of(path))
+        reply_failure(stage, error, remark)
         flush_output()
         os._exit(0)
     reply(OK, b"")
@@ -534,7 +537,7 @@ def reply(tag: int, payload: bytes) -> None:
         data = data[os.write(REPLIES, data) :]
 
 
-def reply_failure(stage: str, error: BaseException) -> None:
+def reply_failure(stage: str, error: BaseException, remark: str = "") -> None:
     """Reports an exception of the policy's code, which may forge its text, but only of its own failure."""
     kind, text, message, missing = None, "", "an exception that cannot be shown", None
     # A hostile exception may raise when it is read; then the parts read so far are reported.
@@ -552,7 +555,7 @@ def reply_failure(stage: str, error: BaseException) -> None:
     report = {
         "stage": stage,
         "kind": kind,
-        "message": sendable(message[:2000]),
+        "message": sendable(message[:2000] + remark),
         "traceback": sendable(text[-MAX_TEXT:]),
         "missing": sendable(missing[:200]) if type(missing) is str else None,
         "used": min(error.used, 1 << 53) if type(error) is TooLargeError else None,

@@ -109,6 +109,30 @@ def converted(value: Any, of_tensor: Callable[[TensorValue], Any]) -> Any:
     return copy(value, 0)
 
 
+class MissingParameterError(KeyError):
+    """A policy has read an environment parameter."""
+
+    def __str__(self) -> str:
+        name = repr(self.args[0])[:100]
+        return f"there is no environment parameter {name}: environments are played with Gymnasium's defaults here"
+
+
+class NoParameters(dict[str, Any]):
+    """The parameters of an environment: none."""
+
+    def __missing__(self, name: str) -> Any:
+        raise MissingParameterError(name)
+
+
+def needs_newer(error: BaseException, source: bytes) -> str:
+    """A remark on an error of the import of a policy of this form that an earlier Python may cause; "" without one."""
+    odd = isinstance(error, SyntaxError | ImportError) and b"make_policy" in source
+    if not odd or sys.version_info[:2] >= (3, 12):
+        return ""
+    own = f"{sys.version_info[0]}.{sys.version_info[1]}"
+    return f" (this worker has Python {own}; policies of this form are written for Python 3.12)"
+
+
 def array_of(tensor: TensorValue) -> Any:
     return np.frombuffer(tensor.data, np.dtype(tensor.dtype).newbyteorder("<")).reshape(tensor.shape)
 
@@ -154,7 +178,7 @@ class Program:
                 observation_space=copy_policy_value(observation_space),
                 action_space=copy_policy_value(action_space),
                 metadata=copy_policy_value(self._metadata),
-                environment_parameters={},
+                environment_parameters=NoParameters(),
                 policy_seed=int.from_bytes(seed[:8], "big"),
             )
         )
