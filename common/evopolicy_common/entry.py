@@ -1,4 +1,5 @@
-"""The console scripts: Ctrl-C while a program imports its modules ends it with one line and exit code 130.
+"""The console scripts: Ctrl-C while a program imports its modules ends it with one line and exit code 130, and so does
+a limit on address space that does not hold its modules, with exit code 2.
 
 This module imports next to nothing, so that little time passes before it can do so.
 """
@@ -21,7 +22,18 @@ def interruptible() -> None:
 def _start(module: str, function: str) -> None:
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # a shell's background job ignores it
         signal.signal(signal.SIGINT, _interrupted)
-    getattr(importlib.import_module(module), function)()
+    try:
+        getattr(importlib.import_module(module), function)()
+    except (ImportError, MemoryError) as error:
+        import resource
+
+        limit = resource.getrlimit(resource.RLIMIT_AS)[0]
+        if limit == resource.RLIM_INFINITY:
+            raise
+        last = (str(error).strip() or "no memory").splitlines()[-1]
+        text = f"error: a limit of {limit >> 10:,} KiB on address space (ulimit -v) is too low: {last}"
+        os.write(2, f"{text}; give: ulimit -v unlimited\n".encode())
+        os._exit(2)
 
 
 def _interrupted(_: int, __: FrameType | None) -> None:

@@ -304,6 +304,8 @@ class Child(ChildProcess):
         """Sends an order; dropped when the child is gone."""
         stdin = self._process.stdin
         assert stdin is not None
+        if stdin.is_closing():
+            return  # asyncio would count such writes, and warn
         with contextlib.suppress(BrokenPipeError, ConnectionResetError):
             stdin.write(line(order))
             await stdin.drain()

@@ -74,6 +74,7 @@ class Requester(Generic[Reply]):
         TransportError after `timeout_s` seconds without any (None: never)."""
         pause, warn_after_s = FIRST_PAUSE_S, WARN_AFTER_S
         started, refused = time.monotonic(), ""
+        about = {"run": run} if (run := getattr(message, "run", "")) else {}
         while True:
             try:
                 return await self.once(verb, message, wanted, wait_s=wait_s)
@@ -82,7 +83,7 @@ class Requester(Generic[Reply]):
                     raise
                 if error.message != refused:
                     why = "the coordinator cannot serve this now; asking again"
-                    log.warning(why, verb=verb, why=error.message)
+                    log.warning(why, verb=verb, why=error.message, **about)
                 started, refused, pause = time.monotonic(), error.message, LONGEST_PAUSE_S
             except TransportError as error:
                 waited = time.monotonic() - started
@@ -90,7 +91,8 @@ class Requester(Generic[Reply]):
                     raise
                 if waited > warn_after_s:
                     warn_after_s = 2.0 * waited
-                    log.warning("still waiting for the coordinator", waited_s=round(waited), why=str(error))
+                    known = {"waited_s": round(waited), "why": str(error), **about}
+                    log.warning("still waiting for the coordinator", **known)
             await asyncio.sleep(pause * random.uniform(0.5, 1.5))
             pause = min(LONGEST_PAUSE_S, pause * 2)
 

@@ -299,6 +299,6 @@ async def test_feedback_that_cannot_be_written_is_reported_without_the_machines_
             while not waits_for:
                 document = json.loads((await w.ask(f"{w.path}/info")).partition(b"\r\n\r\n")[2])
                 waits_for = document["submit_in_flight"]["waits_for"]
-        assert waits_for == "the gateway cannot write feedback: No space left on device"
+        assert waits_for == "the gateway to write feedback: No space left on device"
         await w.served.pipeline.idle()
         await w.submit_honestly(1)
