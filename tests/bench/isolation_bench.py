@@ -1,8 +1,8 @@
 """What it costs that hidden episodes and agents never share a machine: the same sweep with the rule and without, on one
-machine.
+machine, and with the rule and workers that report another kernel, as if they were on another machine.
 
     make bench-isolation
-    make bench-isolation ARGS="--agents 2 --environments toy --parallel 2"
+    make bench-isolation ARGS="--agents 2 --environments toy --repeats 2 --parallel 2"
 
 Agents are uniform random ones with tiny budgets, so nearly all of a run is starting, waiting and scoring: the rule's
 worst case.
@@ -26,12 +26,21 @@ name = "isolation"
 environments = [{environments}]
 [defaults]
 budget = {budget}
+repeats = {repeats}
 validation = {validation}
 heldout = {heldout}
 [parallel]
 machine = {parallel}
 """
 AGENT = '[[agents]]\nname = "{}"\nagent = "random"\n'
+APART = """
+import sys
+if "evopolicy_worker.cli" in sys.orig_argv:
+    from evopolicy_common.processes import host
+    host.boot_id = lambda: "another-kernel"
+"""
+RULES = {"off": "shared", "related": "exclusive", "apart": "exclusive"}
+"""Each sweep, and the stamp of its runs."""
 PHASES = ("agent_s", "queue_s", "rollout_s", "feedback_s", "permit_s", "held_s", "finalise_s")
 
 
@@ -40,6 +49,7 @@ def main() -> None:
         __doc__,
         agents=(4, "of the sweep"),
         environments=(["core16"], "suites, ids or globs"),
+        repeats=(1, "of each agent and environment"),
         parallel=(4, "agents at once"),
         slots=(os.cpu_count() or 1, "of the worker"),
         budget=(4, "train episodes of a run"),
@@ -53,7 +63,7 @@ def main() -> None:
     walls: dict[str, float] = {}
     records: dict[str, list[RunRecord]] = {}
     with tempfile.TemporaryDirectory(prefix="evp-isolation-") as root:
-        for rule in ("off", "related"):
+        for rule in RULES:
             walls[rule], records[rule] = sweep(Path(root) / rule, text, rule, options.slots)
     n = len(records["related"])
     print(
@@ -62,21 +72,20 @@ def main() -> None:
     )
     print(f"load average before: {load:.1f}")
     print(
-        f"wall time: {walls['related']:.0f} s with the rule, {walls['off']:.0f} s without:"
-        f" {walls['related'] / walls['off']:.2f}"
+        "wall time: "
+        + ", ".join(f"{rule} {wall:.0f} s ({wall / walls['off']:.2f})" for rule, wall in walls.items())
     )
     print("seconds a run, in the mean:")
     for phase in PHASES:
         line = "  ".join(
-            f"{name} {sum(getattr(one.timing, phase) for one in records[rule]) / n:7.2f}"
-            for name, rule in (("rule", "related"), ("off", "off"))
+            f"{rule} {sum(getattr(one.timing, phase) for one in records[rule]) / n:7.2f}" for rule in RULES
         )
         print(f"  {phase:<11}{line}")
     retries = {
         rule: sum(int(one.outcome.auxiliary.get("infrastructure_retries", 0)) for one in found)
         for rule, found in records.items()
     }
-    print(f"episodes played again: {retries['related']} with the rule, {retries['off']} without")
+    print("episodes played again: " + ", ".join(f"{rule} {n}" for rule, n in retries.items()))
 
 
 def sweep(root: Path, text: str, rule: str, slots: int) -> tuple[float, list[RunRecord]]:
@@ -84,11 +93,22 @@ def sweep(root: Path, text: str, rule: str, slots: int) -> tuple[float, list[Run
     root.mkdir(parents=True)
     (root / "suite.toml").write_text(text)
     started = time.monotonic()
-    words = ["suite", str(root / "suite.toml"), "--local", "--slots", str(slots), "--hidden-isolation", rule]
+    isolation = "off" if rule == "off" else "related"
+    words = [
+        "suite",
+        str(root / "suite.toml"),
+        "--local",
+        "--slots",
+        str(slots),
+        "--hidden-isolation",
+        isolation,
+    ]
+    if rule == "apart":
+        (root / "sitecustomize.py").write_text(APART)
     with (root / "events.jsonl").open("wb") as events:
         code = subprocess.run(
             [sys.executable, "-m", "evopolicy_gateway.cli", *words, "--runs", str(root / "runs"), "--json"],
-            env={**os.environ, "XDG_STATE_HOME": str(root / "xdg")},
+            env={**os.environ, "XDG_STATE_HOME": str(root / "xdg"), "PYTHONPATH": str(root)},
             stdout=events,
             check=False,
         ).returncode
@@ -98,8 +118,7 @@ def sweep(root: Path, text: str, rule: str, slots: int) -> tuple[float, list[Run
     wall = time.monotonic() - started
     files = sorted((root / "runs").glob("*/*/*/run.json"))
     found = [decode_run_record(file.read_bytes()) for file in files]
-    stamp = {"off": "shared", "related": "exclusive"}[rule]
-    assert {one.hidden_isolation for one in found} == {stamp}
+    assert {one.hidden_isolation for one in found} == {RULES[rule]}
     return wall, found
 
 

@@ -16,7 +16,7 @@ from evopolicy_coordinator.core import loading, machine
 from evopolicy_coordinator.core.agents import permits, precedence, requests
 from evopolicy_coordinator.core.isolation import conflicts, occupancies
 from evopolicy_coordinator.core.leasing import expiry, fleet, groups, leases, queue
-from evopolicy_coordinator.core.runs import finalisation, finished, result_polls, submits
+from evopolicy_coordinator.core.runs import finalisation, finished, result_polls, submits, templates
 from evopolicy_coordinator.core.structures.ledger import Ledger
 from evopolicy_coordinator.core.tables.model import Profile
 from evopolicy_coordinator.core.tables.related import CaseSets
@@ -117,15 +117,6 @@ BUGS = (
     Bug("take a second submit while one runs", submits, "submit", "if run.open is not None:", "if False:"),
     Bug("take submits of a closed run", submits, "submit", 'run.state.phase != "open"', "False", seed=47),
     Bug("accept the same key twice", submits, "submit", "known is not None", "False"),
-    Bug("never preempt", scheduler, "dispatch", "if lane.n_ready[TRAIN]:", "if False:", seed=8),
-    Bug(
-        "forget the hidden jobs that train jobs wait behind",
-        leases,
-        "list_hidden",
-        "if lane.n_ready[TRAIN]:",
-        "if False:",
-        seed=25,
-    ),
     Bug(
         "lease to a poll that was given up unread",
         scheduler,
@@ -224,14 +215,6 @@ BUGS = (
         "or related(state.everywhere.permits, case_set)",
         "",
     ),
-    Bug(
-        "let an agent start before hidden episodes have stopped",
-        conflicts,
-        "permit_conflict",
-        "if not occupancies:",
-        "if not any(occupancy.lease is not None and occupancy.lease.live for occupancy in occupancies):",
-        seed=19,
-    ),
     Bug("take siblings for strangers", CaseSets, "join", "(env, case.seed,", "(len(self._known), case.seed,"),
     Bug("forget permits at a restart", permits, "load", "row.ended_at is not None", "True", seed=13),
     Bug(
@@ -253,33 +236,11 @@ BUGS = (
     ),
     Bug("keep a closed run's permit", finalisation, "close", "permits.end(", "(lambda *_: None)("),
     Bug(
-        "never turn a kernel over to hidden episodes",
-        precedence,
-        "_hidden",
-        "kept_s >= state.settings.hidden_wait_s",
-        "False",
-    ),
-    Bug(
-        "never turn a kernel back",
-        precedence,
-        "_hidden",
-        "lane.done_checks[case_set] >= DONE_CHECKS",
-        "False",
-    ),
-    Bug(
         "hold the submits of an agent that hidden episodes wait for",
         conflicts,
-        "reversed_there",
+        "reserved_there",
         "and not permits_there(state, kernel, case_set)",
         "",
-    ),
-    Bug(
-        "throw the dice of a stopped episode again at once",
-        leases,
-        "put_off",
-        "job.group.template.bundle is None",
-        "True",
-        seed=68,
     ),
     Bug("keep what was handed back in memory only", results, "_keep_begun", "step.persist(", "str("),
     Bug(
@@ -322,14 +283,6 @@ BUGS = (
         seed=19,
     ),
     Bug(
-        "let an agent keep others waiting for ever",
-        precedence,
-        "_hidden",
-        "_end_overdue(state, reversal, step)",
-        "pass",
-        seed=25,
-    ),
-    Bug(
         "cancel a run that keeps others waiting at once",
         precedence,
         "_end_overdue",
@@ -338,11 +291,72 @@ BUGS = (
         seed=9,
     ),
     Bug(
+        "let an agent start before hidden episodes have ended",
+        conflicts,
+        "permit_conflict",
+        "if not occupancies:",
+        "if not any(occupancy.lease is not None and occupancy.lease.live for occupancy in occupancies):",
+    ),
+    Bug(
+        "never reserve a kernel",
+        precedence,
+        "_kept",
+        "flow.kept_s >= state.settings.hidden_wait_s",
+        "False",
+    ),
+    Bug(
+        "never release a reserved kernel",
+        precedence,
+        "check_due",
+        "if not any(flow.n_hidden and flow.lane is lane for flow in reservation.flows):",
+        "if False:",
+    ),
+    Bug(
+        "let later hidden episodes prolong a reservation",
+        precedence,
+        "check_due",
+        "if not any(flow.n_hidden and flow.lane is lane for flow in reservation.flows):",
+        "if not lane.waiting[HIDDEN]:",
+        seed=6,
+    ),
+    Bug(
+        "let an agent keep others waiting for ever",
+        precedence,
+        "_kept",
+        "_end_overdue(state, reservation, step)",
+        "pass",
+        seed=25,
+    ),
+    Bug(
         "believe in kernels on which nobody works",
         precedence,
-        "_hidden",
-        "_at_work(state, kernel)",
+        "_at_work",
+        "(worker.poll or worker.n_live or asked)",
         "True",
-        seed=25,
+        seed=2,
+    ),
+    Bug(
+        "keep agents away for hidden episodes that nobody can play",
+        precedence,
+        "_at_work",
+        "for profile in lane.profiles for",
+        "for profile in state.profiles.values() for",
+        seed=0,
+    ),
+    Bug(
+        "validate while the run is open",
+        finalisation,
+        "submit_ended",
+        "advance(state, news.run, step)",
+        "advance(state, news.run, step); news.row.status != 'ok' or"
+        " _open(state, templates.hidden('validation', news.run, news.row, step), step)",
+    ),
+    Bug(
+        "keep evaluations of open cases from agents' kernels",
+        templates,
+        "hidden_evaluation",
+        "row.split in HIDDEN_SPLITS and",
+        "",
+        seed=14,
     ),
 )

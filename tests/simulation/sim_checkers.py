@@ -10,6 +10,7 @@ from collections import Counter
 from typing import TYPE_CHECKING, Any
 
 from rigs.core_invariants import check_invariants
+from sim_faults import Faults
 from sim_oracle import ExpectedRun, PlannedRun, expect
 from sim_worker import begun_of
 
@@ -27,21 +28,19 @@ from evopolicy_coordinator.core.contract.records import (
 )
 from evopolicy_coordinator.core.leasing import fleet
 from evopolicy_coordinator.core.machine import Core
-from evopolicy_coordinator.core.tables.model import EARLY_VALIDATION, TRAIN
 from evopolicy_coordinator.server.reason_texts import words
 
 if TYPE_CHECKING:
     from sim_scenario import Simulation
 
+EVALUATED_S = 60.0
+"""Longest time that an evaluation of open cases takes without faults."""
 QUIET_S = 600.0
 """Longest time without a commit, after the last fault, that slow workers and long episodes can explain."""
 VALIDATE_EVERY = 7
 """Steps between checks of the core's invariants, which are expensive."""
 HEARD_S = 4.0
 """A worker whose contacts are at most this far apart is never considered lost."""
-PREEMPT_S = 19.0
-"""Longest time that a train job may wait while hidden jobs run in its lane: a partitioned worker with jobs to stop
-counts as about to stop them until their leases would have expired."""
 
 
 class ViolationError(AssertionError):
@@ -74,7 +73,6 @@ class Checkers:
         self._steps = 0
         self._moved_at = 0.0
         self._core: Core | None = None
-        self._early_since: dict[str, float] = {}
         self.drained_at: dict[str, float] = {}
         self.retries = 0
         self.unreasoned = 0
@@ -109,7 +107,7 @@ class Checkers:
         granted = self._granted_to.get((row.job_id, row.attempt))
         want(granted and granted[0] == row.worker, "outcomes come from the leased player", row, granted)
         parts = row.group.split("/")
-        if len(parts) == 3:
+        if parts[0] != "evaluation" and len(parts) == 3:
             submit = self._disk.submits.get((parts[0], int(parts[1][1:])))
             want(submit is not None, "an outcome belongs to a durable submit", row)
             if parts[2] == "train" and submit is not None:
@@ -238,7 +236,11 @@ class Checkers:
         self._granted_at[lease.lease_id] = self._simulation.world.now
         able = self._simulation.workers.get(worker)
         want(able is None or job.env in able.envs, "a worker gets what it can play", worker, job.env)
-        run = group.split("/")[0]
+        run, *_, split = group.split("/")
+        if run == "evaluation":
+            return
+        hidden = split in ("validation", "heldout")
+        want(not hidden or disk.states[run].phase == "closed", "an open run plays nothing hidden", lease)
         pin = disk.states[run].fingerprint_class
         mine = None if core is None else core.state.workers[worker].profile.classes[job.env]
         want(mine in (None, pin), "a run is played by its fingerprint class", worker, lease.lease_id)
@@ -315,11 +317,15 @@ class Checkers:
         wanted = (expected.status, expected.best, expected.heldout, expected.random)
         want(got == wanted, "a run comes to what it does without faults", plan.name, got, wanted)
 
+    def evaluated(self, split: str, seconds: float) -> None:
+        """An evaluation has ended."""
+        quick = split == "heldout" or self._simulation.faults != Faults() or seconds <= EVALUATED_S
+        want(quick, "open cases are played beside agents", seconds)
+
     # ---- the core ----
 
     def loaded(self, core: Core) -> None:
         self._core = core
-        self._early_since = {}
         check_invariants(core.state)
 
     def stepped(self, core: Core) -> None:
@@ -332,20 +338,7 @@ class Checkers:
             want(fleet.offer(core.state, flow) is None, "only runs without workers are unpinned", flow.id)
         if self._steps % VALIDATE_EVERY == 0:
             check_invariants(core.state)
-            self._preempted(core)
             self._drained(core)
-
-    def _preempted(self, core: Core) -> None:
-        """Early validation does not run for long while train jobs wait in its lane."""
-        now = self._simulation.world.now
-        for lane in core.state.lanes.values():
-            name = str(lane.key)
-            leases = [lease for profile in lane.profiles for lease in profile.hidden[EARLY_VALIDATION]]
-            if lane.n_ready[TRAIN] and leases:
-                since = max(self._early_since.setdefault(name, now), core.state.stalled_at)
-                want(now - since < PREEMPT_S, "a waiting train job stops hidden ones", name, leases[0].id)
-            else:
-                self._early_since.pop(name, None)
 
     def _drained(self, core: Core) -> None:
         for name in core.state.out_of_service:

@@ -126,7 +126,8 @@ class SimGateway(Asker):
 
         self.world.after(20.0 + self.world.chance.random() * 60.0, vouch)
 
-    def crash(self) -> None:
+    def crash(self, back_s: float = 0.0) -> None:
+        """The gateway dies, and returns after `back_s` or a little later. Its agent lives on."""
         self.world.note(f"{self.name} dies")
         self.life += 1
         life = self.life
@@ -135,7 +136,7 @@ class SimGateway(Asker):
             if life == self.life and not self.closed:
                 self._open()
 
-        self.world.after(self.world.chance.random() * 5.0, back)
+        self.world.after(back_s + self.world.chance.random() * 5.0, back)
 
     def _open(self) -> None:
         self.boot_id = self.machine.boot_id

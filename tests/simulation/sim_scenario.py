@@ -12,6 +12,7 @@ from sim_coordinator import SimCoordinator
 from sim_faults import HARMLESS, RATES, Faults, draw
 from sim_oracle import PlannedRun, PlannedSubmit
 from sim_store import Disk
+from sim_stories import STORIES, SimEvaluator, Story
 from sim_strangers import HostileOperator, HostileWorker
 from sim_truth import Machine, Truth
 from sim_worker import SimWorker
@@ -60,6 +61,11 @@ class Simulation:
         elif self.crowd:
             # Its hidden episodes are played late, one agent after the other.
             faults = replace(faults, worker_freeze=RATES["worker_freeze"], until_s=400.0)
+        self.told = seed % 2 == 0 and seed % 32 < 16
+        """Whether it plays a story; every other such seed has no faults."""
+        self.story = STORIES[seed % 16 // 2] if self.told else Story(title="")
+        if self.told and seed % 64 < 32:
+            faults = Faults()
         self.faults = faults
         self.harmless = faults == Faults() or all(
             getattr(faults, name) == getattr(Faults(), name)
@@ -73,12 +79,18 @@ class Simulation:
         self.plans = [_plan(f"r{index}", size, chance) for index in range(chance.randint(1, size.runs))]
         self.places = random.Random(seed * 6007 + 3)
         """Randomness for the placement on machines and for the machines' fate."""
-        self.near = seed % 2 == 1
+        self.near = self.told or seed % 2 == 1
         """Agents are on the workers' machines, and runs may have siblings; otherwise each agent has its own machine."""
         if self.crowd:
             env = ENVS[0]
             self.plans = [
                 replace(_plan(f"r{index}", size, chance), env=env, cancel_at=None) for index in range(6)
+            ]
+        if self.told:
+            self.harmless = False
+            self.plans = [
+                replace(_plan(f"r{index}", size, chance), env=ENVS[0], cancel_at=None)
+                for index in range(len(self.story.opened_s))
             ]
         self.hostile = seed % 8 == 1
         """A sibling of all runs has a hostile gateway, and a hostile worker joins; in some crowds, the worker alone."""
@@ -86,25 +98,33 @@ class Simulation:
             self.harmless = False
             cuckoo = replace(self.plans[0], name="cuckoo", submits=(), cancel_at=None, hostile=True)
             self.plans.append(cuckoo)
-        if self.near and (self.crowd or self.hostile or self.places.random() < 0.7):
+        if self.near and (self.crowd or self.hostile or self.told or self.places.random() < 0.7):
             self.plans = [replace(plan, kin=f"kin-{seed}") for plan in self.plans]
-        self.thinks_s = 12.0 if self.crowd else 0.0
+        self.thinks_s = 12.0 if self.crowd else self.story.thinks_s if self.told else 0.0
         """Shortest time that agents are alive between submits."""
         self.truth = Truth(self)
-        self.orderly = self.crowd and faults == Faults()
+        self.orderly = (self.crowd or self.story.orderly) and faults == Faults()
         """Whether the rules alone decide who waits and for how long."""
         self.machines = [
             Machine(f"m{index}") for index in range(1 if self.crowd else self.places.randint(1, 3))
         ]
+        if self.told:
+            self.machines = [Machine(f"m{at}") for at in sorted({at for _, _, at in self.story.workers})]
         self._of_run: dict[str, tuple[Machine, bool]] = {}
         self._older = {
-            plan.name for plan in self.plans if self.near and not self.crowd and self.places.random() < 0.12
+            plan.name
+            for plan in self.plans
+            if self.near and not self.crowd and not self.told and self.places.random() < 0.12
         }
         # In a crowd one slot plays six runs.
-        self._horizon_s = HORIZON_S * max(2.0 if self.crowd else 1.0, size.episodes / Size.episodes)
+        self._horizon_s = HORIZON_S * max(
+            2.0 if self.crowd or self.told else 1.0, size.episodes / Size.episodes
+        )
         if self.hostile:
             self._horizon_s += AGENT_WAIT_S
         self.lengths = chance.choice((0.05, 0.4, 2.0, 4.0))
+        if self.told:
+            self.lengths = self.story.lengths
         self.checkers = Checkers(self)
         self.workers: dict[str, SimWorker] = {}
         self.gateways: list[SimGateway] = []
@@ -116,7 +136,19 @@ class Simulation:
             agent_wait_s=AGENT_WAIT_S * (10.0 if self.crowd else 1.0),
         )
         self.coordinator = SimCoordinator(self.world, self.disk, self.checkers, settings)
-        for index in range(1 if self.crowd else chance.randint(1, size.workers)):
+        for index, (version, slots, at) in enumerate(self.story.workers if self.told else ()):
+            name = f"w{index}"
+            self.workers[name] = SimWorker(
+                self,
+                name,
+                slots,
+                ENVS,
+                version,
+                self.machines[at],
+                tells_kernel=True,
+                mute=name == self.story.mute,
+            )
+        for index in range(0 if self.told else 1 if self.crowd else chance.randint(1, size.workers)):
             envs = ENVS if index == 0 or chance.random() < 0.6 else ENVS[:1]
             version = "1" if index == 0 or chance.random() < 0.8 else "2"
             name = f"w{index}"
@@ -130,18 +162,31 @@ class Simulation:
         opened_s = 30.0 if self.absent else 0.0
         self.operators = [
             (HostileOperator if plan.hostile else SimOperator)(
-                self, plan, opened_s + chance.random() * 3.0 + (20.0 * index if self.crowd else 0.0)
+                self,
+                plan,
+                self.story.opened_s[index] + 1.0
+                if self.told
+                else opened_s + chance.random() * 3.0 + (20.0 * index if self.crowd else 0.0),
             )
             for index, plan in enumerate(self.plans)
         ]
         if self.hostile or seed % 32 == 19:
             HostileWorker(self)
+        self.evaluators = [
+            SimEvaluator(self, name, self.story.evaluations)
+            for name in ("e0", "e1", "e2", "e3")
+            if self.story.evaluations
+        ]
         self._plan_faults()
+        self._plan_story()
 
     # ---- machines ----
 
     def machine_of(self, plan: PlannedRun) -> tuple[Machine, bool]:
         """The machine of a run's gateway and agent, and whether the gateway reports it."""
+        if self.told:
+            machine = Machine(f"m-of-{plan.name}") if self.story.remote else self.machines[0]
+            return self._of_run.setdefault(plan.name, (machine, not self.story.anywhere or plan.name != "r0"))
         if plan.name not in self._of_run:
             apart = not self.near or (not self.crowd and self.places.random() < 0.25)
             machine = Machine(f"m-of-{plan.name}") if apart else self.places.choice(self.machines)
@@ -200,17 +245,36 @@ class Simulation:
             world.after(at, lambda: self.coordinator.stall(chance.random() * 40.0))
         for at in times(faults.liveness_flap):
             world.after(at, self._flap)
-        if self.near and not self.harmless and not self.orderly:
+        if self.near and not self.harmless and not self.orderly and not self.told:
             for fault, rate in ((self._reboot, 0.3), (self._move, 0.3)):
                 if self.places.random() < rate:
                     world.after(self.places.random() * faults.until_s, fault)
-        if not self.harmless and not self.orderly and chance.random() < 0.3:
+        if not self.harmless and not self.orderly and not self.told and chance.random() < 0.3:
             world.after(chance.random() * faults.until_s, self._drain)
         for worker in self.workers.values():
             if self.absent == "frozen":
                 world.after(2.0, lambda worker=worker: worker.freeze(45.0))  # type: ignore[misc]
             elif self.absent == "paused":
                 world.after(2.0, lambda name=worker.name: self._take_out(name, "paused", 45.0))  # type: ignore[misc]
+
+    def _plan_story(self) -> None:
+        for at in self.story.reboots:
+            self.world.after(at, self._reboot)
+        for at in self.story.restarts:
+            self.world.after(at, self.coordinator.crash, "as the story goes")
+        if self.story.lost_s:
+            self.world.after(14.0, self._lose_gateways)
+
+    def _lose_gateways(self) -> None:
+        for each in self.gateways:
+            if not each.closed:
+                each.crash(self.story.lost_s)
+
+    def run_closed(self) -> None:
+        """A run's closing was acknowledged."""
+        if self.story.pauses:
+            self.story = replace(self.story, pauses=False)
+            self._take_out("w0", "paused", 200.0)
 
     def _some_worker(self) -> SimWorker:
         return self.world.chance.choice(list(self.workers.values()))
@@ -265,13 +329,10 @@ class Simulation:
         self.world.calm_at = self.world.now
         self.world.run(self.world.now + 20.0, lambda: False)
         self.checkers.ended(self.coordinator.core)
-        if (
-            self.faults == Faults()
-            and not self.hostile
-            and not self.truth.agents
-            and max(self.truth.waited_s, default=0.0) > PERMIT_S
-        ):
-            raise ViolationError(f"an agent waits {max(self.truth.waited_s):.0f} s for its permit")
+        most_s = min(PERMIT_S, self.story.permit_s)
+        longest_s = max(self.truth.waited_s, default=0.0)
+        if self.faults == Faults() and not (self.hostile or self.truth.agents) and longest_s > most_s:
+            raise ViolationError(f"an agent waits {longest_s:.0f} s for its permit")
 
     def over(self) -> bool:
         """Whether all runs have ended."""

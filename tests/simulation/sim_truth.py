@@ -79,6 +79,7 @@ class Truth:
         """The closing of a run was acknowledged."""
         self.kept_since.setdefault(plan.name, self._simulation.world.now)
         self._look()
+        self._simulation.run_closed()
 
     def _look(self) -> None:
         finished = self._simulation.checkers.finished_runs
@@ -108,7 +109,10 @@ class Truth:
 
     def play_starts(self, worker: str, lease: wire.Lease, boot_id: str) -> None:
         name, _, rest = lease.job.job_id.partition("/")
-        plan = next((each for each in self._simulation.plans if each.name == name), None)
+        plans = self._simulation.plans
+        plan = next((each for each in plans if each.name == name), None)
+        if name == "evaluation" and self._simulation.story.evaluations == "heldout":
+            plan, rest = plans[0], "heldout/"
         hidden = "/validation/" in f"/{rest}" or "/heldout/" in f"/{rest}"
         train = "/train/" in f"/{rest}"
         if plan is None or not (hidden or train):

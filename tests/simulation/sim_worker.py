@@ -109,8 +109,11 @@ class SimWorker(Asker):
         machine: Machine,
         *,
         tells_kernel: bool,
+        mute: bool = False,
     ) -> None:
         super().__init__(simulation, name)
+        self.mute = mute
+        """Whether it never polls."""
         self.slots, self.envs, self.version = slots, envs, version
         self.machine = machine
         self.tells_kernel = tells_kernel
@@ -248,7 +251,7 @@ class SimWorker(Asker):
 
     def _poll(self) -> None:
         wanted = self.slots - len(self.running) - len(self.queue)
-        if self.polling or wanted <= 0 or not self.session:
+        if self.polling or wanted <= 0 or not self.session or self.mute:
             return
         self.polling = True
         self.serial += 1

@@ -115,7 +115,7 @@ class QueuedJobs(msgspec.Struct, frozen=True, kw_only=True):
     """The unfinished jobs of one priority and environment."""
 
     priority: Word
-    """`train`, `reference`, `heldout` or `validation` (of runs that are still open)."""
+    """`train`, `reference` or `hidden`."""
     env: Word
     runs: Int
     """Number of runs and evaluations."""

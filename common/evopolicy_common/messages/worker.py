@@ -183,7 +183,7 @@ class HeartbeatReply(Message, frozen=True, kw_only=True, tag="beat_reply"):
     """Leases that the worker has to stop."""
 
     cancelled: Many[Text] = ()
-    """Leases to stop at once: expired, cancelled or preempted."""
+    """Leases to stop at once: expired or cancelled."""
     drain: bool = False
     """Request no more work; finish the running jobs."""
     describe: Many[Word] = ()
@@ -191,7 +191,7 @@ class HeartbeatReply(Message, frozen=True, kw_only=True, tag="beat_reply"):
 
 
 ResultKind = Literal["done", "returned", "slot_died", "failed"]
-"""done: played. returned: given back unfinished (drained, preempted, cancelled). failed: infrastructure.
+"""done: played. returned: given back unfinished (drained, cancelled). failed: infrastructure.
 slot_died: only from workers of earlier versions; the same as failed."""
 
 

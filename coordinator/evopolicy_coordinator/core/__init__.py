@@ -39,7 +39,7 @@ tokens of all runs, finished ones too. The core checks sessions: it answers a re
 `Refused("unknown_worker")`. The worker then registers again, sends a heartbeat with all leases that it holds, and
 continues.
 
-*Stopped leases.* A worker learns of leases to stop (preempted, cancelled, played elsewhere) from the first of these
+*Stopped leases.* A worker learns of leases to stop (cancelled, played elsewhere) from the first of these
 replies: its waiting lease poll, a heartbeat whose reply is delayed (`wait_s`), or its next heartbeat.
 
 *Long polls* (leases, results, evaluations, waiting for a run) are soft state of the core with deadlines. Each event

@@ -95,8 +95,6 @@ def _run(state: State, run: Run, rows: list[SubmitRow], loading: Loading, step: 
             heads = loading.heads.pop(submit_group(run.id, row.submit_index, "validation"), [])
             failed = sum(head.failure is not None for head in heads)
             run.hidden_failures[submit_group(run.id, row.submit_index, "validation")] = failed
-        elif row.status == "ok" and row.ineligible is None:
-            finalisation.validate(state, run, row, step)
     finalisation.advance(state, run, step)
 
 

@@ -17,7 +17,6 @@ from evopolicy_coordinator.core.leasing import pins
 from evopolicy_coordinator.core.runs import finished
 from evopolicy_coordinator.core.runs.waits import waits_for
 from evopolicy_coordinator.core.tables.model import (
-    EARLY_VALIDATION,
     PRIORITY_NAMES,
     RANKS,
     JobGroup,
@@ -113,7 +112,7 @@ def _worker(state: State, worker: Worker, now: float, refused: dict[str, str]) -
 def _run(
     state: State, run: Run, groups: list[JobGroup], waits: dict[JobGroup, Reason], words: Words
 ) -> RunStatus:
-    waiting = [waits[group] for group in groups if group in waits and not _yields(group, waits[group])]
+    waiting = [waits[group] for group in groups if group in waits]
     progress, waits_at_end = finished.progress(state, run)
     settings = run.row.settings
     return shared(
@@ -145,7 +144,7 @@ def _stalls(state: State, now: float, words: Words) -> tuple[str, ...]:
     for group in state.groups.values():
         waiting = [job for job in group.jobs.values() if job.lease is None and now - job.since > limit_s]
         reason = waits_for(state, group) if waiting else None
-        if waiting and not (reason is not None and _yields(group, reason)):
+        if waiting:
             what = words(reason) or f"a free slot among {group.flow.lane.slots() if group.flow.lane else 0}"
             waits.setdefault((group.run, what), []).extend(waiting)
         for job in group.jobs.values():
@@ -166,8 +165,3 @@ def _stalls(state: State, now: float, words: Words) -> tuple[str, ...]:
             f" {oldest.job_id} for {now - oldest.since:.0f} s{again}"
         )
     return tuple(stalls)
-
-
-def _yields(group: JobGroup, reason: Reason) -> bool:
-    """Whether the group is validation ahead of the run's end, which waits for agents and other work as it should."""
-    return group.priority == EARLY_VALIDATION and reason.code in ("agent_alive", "related_train", "free_slot")

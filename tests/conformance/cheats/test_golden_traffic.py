@@ -108,7 +108,7 @@ def test_no_answer_to_a_gateway_holds_more_than_its_fields(golden: GoldenRun) ->
 
 @pytest.mark.parametrize(
     "place",
-    ["supervisor, after the validation", "gateway, after the validation", "gateway, after the scoring"],
+    ["supervisor beside the agent", "gateway beside the agent", "gateway, after the scoring"],
 )
 def test_nothing_hidden_is_in_the_memory_of_the_agents_side(golden: GoldenRun, place: str) -> None:
     hidden, visible = hidden_of(golden), visible_of(golden)
@@ -152,12 +152,11 @@ def test_the_search_finds_the_seeds_and_returns_where_they_do_cross(golden: Gold
 
 def test_a_planted_leak_is_found_in_traffic_memory_and_workspace(leaky: GoldenRun) -> None:
     hidden = hidden_of(leaky)
-    expected = {"return of validation of submit 0 0", "return of validation of submit 0 1"}
-    wanted = seeds_of(leaky) | expected
+    wanted = seeds_of(leaky)
     assert wanted <= hidden.found_in(bytes(leaky.wiretap.heard))
     tapped = [hidden.found_in(payload) for _, _, payload in leaky.cluster.crossed(f"/gw/{leaky.run}/")]
     assert wanted <= set().union(*tapped)
     assert wanted <= set().union(*(hidden.found_in(data) for data in leaky.found_early.values()))
-    memory = leaky.memory["gateway, after the validation"]
+    memory = leaky.memory["gateway beside the agent"]
     # The task's text is kept for as long as the gateway lives; what else it was told may be overwritten by now.
     assert seeds_of(leaky) <= set().union(*(hidden.found_in(region, short=False) for region in memory))

@@ -1,5 +1,5 @@
 """An agent listens to its machine while hidden episodes of its environment would be played: it hears nothing, as none
-is played there before it is gone. With the rule switched off the same agent hears which cases are played.
+is played there before it is gone. With the rule switched off a sibling's agent hears which cases are played.
 
 The channel stands for all that sandbox and jail cannot close: memory shared by processes, which the kernel counts for
 the whole machine. They do close this one, so policies and agents have neither here: the rule holds without them, and
@@ -140,18 +140,17 @@ def hears(run: Listening, wanted: list[int]) -> bool:
     return False
 
 
-def test_without_the_rule_an_agent_hears_its_own_hidden_cases(shared: GoldenCluster) -> None:
-    heard = False
-    for attempt in range(TRIES):
-        with listening(shared, f"own{attempt}", 1) as run:
-            run.listens()
-            heard = hears(run, pulses(shared, "valid"))
-            record = run.stop()
-        assert record.hidden_isolation == "shared"
-        if heard:
-            break
-    assert heard
-    assert met(shared, moments(shared))
+def test_without_the_rule_an_agent_hears_none_of_its_hidden_cases(shared: GoldenCluster) -> None:
+    """Attack: listens while its own checkpoints are validated. Defence: hidden episodes start when the run has closed,
+    with any `--hidden-isolation`."""
+    with listening(shared, "own", 1) as run:
+        run.listens()
+        time.sleep(QUIET_S)
+        assert "hidden" not in {moment.what for moment in moments(shared)}
+        assert recognised(run.heard(), pulses(shared, "valid")) == 0
+        record = run.stop()
+    assert record.hidden_isolation == "shared"
+    assert len(record.outcome.heldout_returns) == N_HIDDEN
 
 
 def test_no_hidden_case_is_played_beside_an_agent_that_listens(

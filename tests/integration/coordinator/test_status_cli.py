@@ -59,9 +59,7 @@ async def test_status_shows_workers_runs_and_what_waits(coordinator: Coordinator
             async with working(coordinator, "w-shown"):
                 await gateway.results(0)
                 result = await called(coordinator, "status")
-                # The checkpoint's early validation goes on for a moment.
-                while "0 queued, 0 running" not in result.stdout:
-                    result = await called(coordinator, "status")
+                assert "0 queued, 0 running" in result.stdout
                 assert result.exit_code == 0
                 for text in ("cluster local", "w-shown", created.run, "toy/line", "14/16"):
                     assert text in result.stdout

@@ -170,9 +170,7 @@ async def test_a_whole_run_goes_through_the_supervisor(coordinator: Coordinator,
         assert finished["status"] == "completed"
         assert len(finished["heldout_returns"]) == 4
         assert finished["nondeterministic_results"] == 0
-        # 16 train, 2 × 3 validation, 4 held-out, 4 random; the second submit may have stopped validation that was
-        # played by the time it heard of it.
-        assert 30 <= worker.jobs_done <= 33
+        assert worker.jobs_done == 30  # 16 train, 2 × 3 validation, 4 held-out, 4 random
 
 
 async def until_told(operator: OperatorClient, reason: str, told: Callable[[WorkerStatus], bool]) -> str:
@@ -523,43 +521,6 @@ async def test_a_silent_coordinator_stops_hidden_episodes_only(
         finished = await operator.finished(created.run)
     assert sorted(name.rsplit("/", 2)[1] for name in stopped) == ["validation", "validation"]
     assert (finished.status, finished.infrastructure_retries) == ("completed", 0)
-
-
-async def test_a_waiting_submit_stops_hidden_episodes_that_would_never_end(
-    coordinator: Coordinator, tmp_path: Path
-) -> None:
-    """Attack: sleeps or crashes on hidden cases to make its agent's submits wait or fail. Defence: train
-    jobs pre-empt hidden ones; outcomes of hidden jobs stay secret until the end."""
-    hanging = asyncio.Event()
-    stopped: list[str] = []
-    go_on = asyncio.Event()
-
-    async def hang_while_hidden(slot: ScriptedSlot, job: Job) -> None:
-        if job.record == "actions" and not go_on.is_set():
-            hanging.set()
-            await hang(slot, go_on)
-            if not go_on.is_set():
-                stopped.append(job.job_id)
-                raise SandboxError("cancelled")
-
-    async with (
-        supervising(coordinator, tmp_path, hang_while_hidden),
-        operator_of(coordinator) as operator,
-    ):
-        created = await operator.create(n_validation=3, n_heldout=2)
-        async with gateway_of(coordinator, created) as gateway:
-            for number in range(3):
-                await gateway.submit(bundle_of(f"policy {number}"), (0, 1, 2), f"k{number}")
-                await gateway.results(number)
-                await hanging.wait()
-                hanging.clear()
-            go_on.set()
-            await gateway.close()
-        finished = await operator.finished(created.run)
-    assert finished.status == "completed"
-    assert stopped
-    # Being stopped is nobody's failure.
-    assert finished.infrastructure_retries == 0
 
 
 @pytest.mark.parametrize(

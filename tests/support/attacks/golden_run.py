@@ -1,5 +1,5 @@
-"""Whole runs with everything that crosses to a gateway kept, and its memory read: while hidden episodes are played, and
-when all of them are done but the gateway has not yet been let go."""
+"""Whole runs with everything that crosses to a gateway kept, and its memory read: while the agent lives, and when all
+hidden episodes are done but the gateway has not yet been let go."""
 
 from __future__ import annotations
 
@@ -22,12 +22,11 @@ from waiting import wait_until
 
 from attacks.leak_search import memory_of
 from attacks.wiretap import Wiretap
-from evopolicy_common.messages import gateway, worker
 from evopolicy_common.messages.environment import Split
-from evopolicy_common.messages.episode import EpisodeOutcome, Job
+from evopolicy_common.messages.episode import EpisodeOutcome
 from evopolicy_common.messages.operator import EvaluationPage, RecordedRequest, RunFinished
 from evopolicy_common.processes import proc
-from evopolicy_common.wire import codec, credentials
+from evopolicy_common.wire import credentials
 from evopolicy_common.wire.transport import connect
 
 N_CASES: dict[str, int] = {"train": 4, "valid": 2, "heldout": 2}
@@ -114,24 +113,6 @@ class GoldenCluster:
             start = end
         return found
 
-    def validations_of(self, bundles: set[str]) -> int:
-        """Validation episodes of these bundles that workers have reported."""
-        seeds = {case.seed for case in self.cases["valid"]}
-        jobs: dict[str, Job] = {}
-        done: set[str] = set()
-        for way, _, payload in self.crossed("/work/"):
-            if way == "answer":
-                reply = codec.decode(codec.worker_replies, payload)
-                if isinstance(reply, worker.Leases):
-                    jobs |= {lease.job.job_id: lease.job for lease in reply.leases}
-            else:
-                message = codec.decode(codec.worker_requests, payload)
-                if isinstance(message, worker.ReportResults):
-                    done |= {result.job_id for result in message.results if result.kind == "done"}
-        return sum(
-            jobs[name].bundle in bundles and jobs[name].episodes[0].case.seed in seeds for name in done
-        )
-
     def ask(self, question: Callable[[OperatorClient], Any]) -> Any:
         """The coordinator's replies to an operator."""
 
@@ -192,13 +173,11 @@ class GoldenRun:
         self.memory: dict[str, list[bytes]] = {}
         for number in range(N_SUBMITS):
             cluster.wait_for(lambda n=number: self._at_work(process, f"submitted-{n}"))  # type: ignore[misc]
-            n_played = (number + 1) * N_CASES["valid"]
-            cluster.wait_for(lambda n=n_played: cluster.validations_of(self._bundles()) == n)  # type: ignore[misc]
             if number == N_SUBMITS - 1:
                 self.gateway = self._process_of(process.pid, b"evopolicy_gateway.cli.serve")
                 supervisor = self._process_of(process.pid, b"evopolicy_gateway.agent_supervisor.supervisor")
                 for who, pid in (("gateway", self.gateway), ("supervisor", supervisor)):
-                    self.memory[f"{who}, after the validation"] = list(memory_of(pid))
+                    self.memory[f"{who} beside the agent"] = list(memory_of(pid))
             (self.workspace / f"go-{number}").touch()
         # The gateway stands still before its word that the run is over gets away, until all is scored.
         self.finished: RunFinished = cluster.ask(lambda client: client.finished(self.run))
@@ -238,13 +217,6 @@ class GoldenRun:
     def _at_work(self, process: subprocess.Popen[bytes], file: str) -> bool:
         assert process.poll() is None, self.log.read_text()
         return (self.workspace / file).exists()
-
-    def _bundles(self) -> set[str]:
-        """Digests of what this run's gateway has submitted."""
-        crossed = self.cluster.crossed(f"/gw/{self.run}/submit")
-        asked = [payload for way, _, payload in crossed if way == "question"]
-        found = [codec.decode(codec.gateway_requests, data) for data in asked]
-        return {one.bundle for one in found if isinstance(one, gateway.Submit) and one.bundle is not None}
 
     def _process_of(self, parent: int, module: bytes) -> int:
         (found,) = [

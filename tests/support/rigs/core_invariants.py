@@ -7,7 +7,7 @@ from collections import Counter
 from evopolicy_coordinator.core.contract.records import submit_group
 from evopolicy_coordinator.core.isolation.kernels import all_related, related
 from evopolicy_coordinator.core.structures import InvariantError
-from evopolicy_coordinator.core.tables.model import N_PRIORITIES, TRAIN, JobState
+from evopolicy_coordinator.core.tables.model import N_PRIORITIES, JobState
 from evopolicy_coordinator.core.tables.state import State
 from evopolicy_coordinator.core.tables.transitions import JOB, RUN, SUBMIT
 
@@ -67,10 +67,17 @@ def _isolation(state: State) -> None:
     flows |= {run.flow for run in state.runs.values()} | {each.flow for each in state.evaluations.values()}
     users = Counter(flow.case_set for flow in flows if flow.case_set is not None)
     for kernel in state.kernels.values():
-        for index in (kernel.permits, kernel.asks, kernel.hidden, kernel.train, kernel.reversals):
+        for index in (kernel.permits, kernel.asks, kernel.hidden, kernel.train, kernel.reservations):
             users.update({case_set: len(there) for case_set, there in index.items() if case_set is not None})
     for case_set in state.case_sets.known():
         want("", case_set.users == users[case_set], "a case set is kept while it has users")
+    for group in state.groups.values():
+        run = state.runs.get(group.run)
+        want(
+            group.id,
+            not (run and group.hidden and run.state.phase == "open"),
+            "an open run plays nothing hidden",
+        )
     for group in state.held:
         want(group.id, group.held_since is not None and not group.closed, "only open groups are held")
 
@@ -100,7 +107,6 @@ def _jobs(state: State) -> None:
             holds = {
                 "queued": job in (state.suspects if job.alone else ready),
                 "leased": job.lease is not None,
-                "parting": job.parting is not None,
                 "backing_off": ("job", key) in state.timers,
                 "adopting": job in state.adopting,
             }
@@ -110,10 +116,6 @@ def _jobs(state: State) -> None:
             if job.reserved is not None:
                 emptied = state.workers.get(job.reserved)
                 want(key, emptied and emptied.reserved is job, "a suspect's worker reserves it")
-            stopped = job.parting
-            if stopped is not None:
-                there = state.workers[stopped.worker].leases.get(stopped.id) is stopped
-                want(key, there and not stopped.live, "the worker holds the stopped lease")
             lease = job.lease
             if lease is not None:
                 worker = state.workers.get(lease.worker)
@@ -132,6 +134,8 @@ def _queue(state: State) -> None:
     for flow in flows:
         leased = sum(group.n_leased for group in state.groups.values() if group.flow is flow)
         want(flow.id, leased == flow.n_leased, "a flow counts its leased jobs")
+        hidden = sum(group.hidden for group in state.groups.values() if group.flow is flow)
+        want(flow.id, hidden == flow.n_hidden, "a flow counts its open groups of hidden jobs")
         unpinned = state.unpinned.get(flow.id) is flow
         want(flow.id, unpinned == (flow.pin is None), "a flow without a pin waits for one")
         for priority in range(N_PRIORITIES):
@@ -141,21 +145,7 @@ def _queue(state: State) -> None:
             want(flow.id, not stray, "only queued jobs of that priority are in the queue")
             if flow.lane is not None and flow.n_ready[priority]:
                 want(flow.id, flow.in_heap[priority], "a flow with ready jobs is in its lane's heap")
-    stopping = Counter(
-        lease.stopped_for.key
-        for worker in state.workers.values()
-        for lease in worker.leases.values()
-        if lease.stopped_for is not None
-    )
     for lane in state.lanes.values():
-        want(str(lane.key), lane.stopping == stopping[lane.key], "stopping jobs are counted")
-        hidden = any(any(profile.hidden) for profile in lane.profiles)
-        checked_at = ("lane", lane.key) in state.timers
-        want(
-            str(lane.key),
-            checked_at or not (lane.n_ready[TRAIN] and hidden),
-            "a lane to preempt in has a deadline",
-        )
         for priority in range(N_PRIORITIES):
             total = sum(flow.n_ready[priority] for flow in flows if flow.lane is lane)
             want(str(lane.key), total == lane.n_ready[priority], "a lane counts its flows' ready jobs")
@@ -163,10 +153,9 @@ def _queue(state: State) -> None:
         for priority in range(N_PRIORITIES):
             case_sets = Counter(job.group.flow.case_set for job in waiting if job.priority == priority)
             want(str(lane.key), dict(case_sets) == lane.waiting[priority], "waiting case sets are counted")
-        backlog = Counter(
-            job.group.flow.case_set for job in waiting if job.group.hidden and job.group.flow.closed
-        )
-        want(str(lane.key), dict(backlog) == lane.backlog, "hidden jobs of closed runs are counted")
+        for reservation in lane.reservations.values():
+            there = reservation.kernel.reservations.get(reservation.case_set, {})
+            want(str(lane.key), there.get(str(lane.key)) is reservation, "its kernel lists a reservation")
         for profile in lane.profiles:
             want(str(lane.key), (lane in profile.busy) == any(lane.n_ready), "profiles list busy lanes")
 
@@ -180,10 +169,7 @@ def _workers(state: State) -> None:
             want(name, state.workers[name].poll is not None, "a parked worker has a poll")
         for names in profile.warm.values():
             want(key, names.keys() <= profile.parked.keys(), "warm workers are parked")
-        for priority, hidden in enumerate(profile.hidden):
-            for lease in hidden:
-                fits = lease.live and lease.job.priority == priority != TRAIN
-                want(lease.id, fits, "preemptible leases are live and hidden")
+
     for worker in state.workers.values():
         want(worker.name, worker.state != "lost" or not worker.leases, "a lost worker holds nothing")
         timed = ("worker", worker.name) in state.timers or worker.state == "lost"

@@ -4,8 +4,8 @@ Rules that this module owns:
 - A permit ends when its run's gateway closes the run, `CANCELLED_S` after its run is cancelled, or by an operator's
   command; never by silence, and never by a report of another run's gateway or of a worker.
 - A permit on a kernel that no worker names, such as that of a machine before its restart, bars nothing.
-- A requested permit stops related hidden jobs, without blame, unless the kernel is reserved for them (`precedence`). It
-  is granted once their workers have released them.
+- While a permit is requested, no related hidden job is leased on its kernel, unless the kernel is reserved for them
+  (`precedence`). It is granted once those that are played there have ended.
 """
 
 from __future__ import annotations
@@ -19,8 +19,7 @@ from evopolicy_common.messages.run_settings import ELSEWHERE
 from evopolicy_coordinator.core.contract.reasons import Reason
 from evopolicy_coordinator.core.contract.records import PermitRow, RunRow, RunStateRow
 from evopolicy_coordinator.core.isolation import conflicts, kernels
-from evopolicy_coordinator.core.isolation.kernels import all_related, put, related
-from evopolicy_coordinator.core.leasing import leases
+from evopolicy_coordinator.core.isolation.kernels import put
 from evopolicy_coordinator.core.structures import take
 from evopolicy_coordinator.core.tables.model import Ask, CaseSet, Kernel, Run
 from evopolicy_coordinator.core.tables.state import State
@@ -60,21 +59,7 @@ def ask(state: State, run: Run, row: PermitRow, step: Step) -> Reason | None:
         case_set.users += 1
         ask = state.asks[run.id, kernel.boot_id] = Ask(row, case_set, kernel)
         put(kernel.asks, case_set, run.id, ask)
-    _preempt(state, case_set, kernel, step)
     return _grant(state, run.id, kernel, case_set, step)
-
-
-def _preempt(state: State, case_set: CaseSet, kernel: Kernel, step: Step) -> None:
-    """Stop related hidden jobs for a permit, unless they have precedence."""
-    if not state.isolates:
-        return
-    there = list(state.kernels.values()) if kernel is state.everywhere else [kernel]
-    if any(related(each.reversals, case_set) for each in there):
-        return
-    for each in there:
-        for occupancy in all_related(each.hidden, case_set):
-            if occupancy.lease is not None and occupancy.lease.live:
-                leases.put_off(state, occupancy.lease, step)
 
 
 def _grant(state: State, run: str, kernel: Kernel, case_set: CaseSet, step: Step) -> Reason | None:
@@ -127,7 +112,6 @@ def settle(state: State, step: Step) -> None:
     """At the end of a step: grant requested permits that have become possible."""
     state.grantable = False
     for ask in list(state.asks.values()):
-        _preempt(state, ask.case_set, ask.kernel, step)
         _grant(state, ask.row.run, ask.kernel, ask.case_set, step)
 
 

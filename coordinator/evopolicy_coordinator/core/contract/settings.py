@@ -42,8 +42,6 @@ class CoreSettings(msgspec.Struct, frozen=True, kw_only=True):
     """Most leases that a slot may hold in advance, however short its episodes."""
     warm_bonus_s: float = 2.0
     """How far a run may exceed its fair share, in slot seconds, on a worker that has its environment or bundle warm."""
-    preemptions_max: int = 3
-    """A hidden job of a closed run is preempted by train jobs at most this often."""
     job_deadline_s: float = 3600.0
     """Longest that one episode may be played, apart from the policy's limits; after that it counts as hung."""
     stall_s: float = 60.0

@@ -15,14 +15,12 @@ from evopolicy_coordinator.core.contract.records import PermitRow
 from evopolicy_coordinator.core.isolation import kernels
 from evopolicy_coordinator.core.isolation.kernels import all_related, related
 from evopolicy_coordinator.core.tables.model import (
-    EARLY_VALIDATION,
     HIDDEN,
     TRAIN,
     CaseSet,
     JobGroup,
     JobState,
     Kernel,
-    Lease,
     Worker,
 )
 from evopolicy_coordinator.core.tables.state import State
@@ -37,9 +35,9 @@ def concerns(state: State, priority: int, worker: Worker) -> bool:
     """Whether `conflict` may hold for any case set."""
     if priority == TRAIN:
         kernel = worker.kernel
-        there = kernel.hidden or kernel.reversals or state.everywhere.hidden
+        there = kernel.hidden or kernel.reservations or state.everywhere.hidden
         return state.isolates and (bool(there) or kernel is state.everywhere)
-    return state.isolates and priority in HIDDEN
+    return state.isolates and priority == HIDDEN
 
 
 def conflict(state: State, priority: int, case_set: CaseSet | None, worker: Worker) -> bool:
@@ -48,17 +46,15 @@ def conflict(state: State, priority: int, case_set: CaseSet | None, worker: Work
         return False
     if priority == TRAIN:
         return train_conflict(state, case_set, worker.kernel)
-    if priority not in HIDDEN:
+    if priority != HIDDEN:
         return False
-    return hidden_conflict(state, case_set, worker.kernel) is not None or _train_waits(
-        priority, case_set, worker
-    )
+    return hidden_conflict(state, case_set, worker.kernel) is not None or _train_waits(case_set, worker)
 
 
-def _train_waits(priority: int, case_set: CaseSet | None, worker: Worker) -> bool:
+def _train_waits(case_set: CaseSet | None, worker: Worker) -> bool:
     """Whether related train jobs wait for workers like this one: hidden jobs must not delay them."""
     assert case_set is not None
-    if priority != EARLY_VALIDATION and related(worker.kernel.reversals, case_set):
+    if related(worker.kernel.reservations, case_set):
         return False
     busy = worker.profile.busy
     return any(
@@ -70,17 +66,17 @@ def train_conflict(state: State, case_set: CaseSet | None, kernel: Kernel) -> bo
     """Whether hidden jobs keep train jobs of a case set from a kernel."""
     if kernel is state.everywhere:
         return any(
-            related(each.hidden, case_set) or reversed_there(state, each, case_set)
+            related(each.hidden, case_set) or reserved_there(state, each, case_set)
             for each in state.kernels.values()
         )
     if related(kernel.hidden, case_set) or related(state.everywhere.hidden, case_set):
         return True
-    return bool(kernel.reversals) and reversed_there(state, kernel, case_set)
+    return bool(kernel.reservations) and reserved_there(state, kernel, case_set)
 
 
-def reversed_there(state: State, kernel: Kernel, case_set: CaseSet | None) -> bool:
+def reserved_there(state: State, kernel: Kernel, case_set: CaseSet | None) -> bool:
     """Whether the kernel is reserved for related hidden jobs and train jobs of the case set are held back for it."""
-    return related(kernel.reversals, case_set) is not None and not permits_there(state, kernel, case_set)
+    return related(kernel.reservations, case_set) is not None and not permits_there(state, kernel, case_set)
 
 
 def permits_there(state: State, kernel: Kernel, case_set: CaseSet | None) -> dict[str, PermitRow] | None:
@@ -95,8 +91,8 @@ def hidden_conflict(state: State, case_set: CaseSet | None, kernel: Kernel) -> s
         return "kernel"
     if permits_there(state, kernel, case_set):
         return "agent"
-    turned_over = related(kernel.reversals, case_set)
-    if not turned_over and (related(kernel.asks, case_set) or related(state.everywhere.asks, case_set)):
+    reserved = related(kernel.reservations, case_set)
+    if not reserved and (related(kernel.asks, case_set) or related(state.everywhere.asks, case_set)):
         return "asked"
     if related(kernel.train, case_set) or related(state.everywhere.train, case_set):
         return "train"
@@ -108,13 +104,13 @@ def permit_conflict(state: State, case_set: CaseSet, kernel: Kernel) -> Reason |
     if not state.isolates:
         return None
     there = state.kernels.values() if kernel is state.everywhere else (kernel, state.everywhere)
-    if any(related(each.reversals, case_set) for each in there):
+    if any(related(each.reservations, case_set) for each in there):
         return because("scoring")
     occupancies = [occupancy for each in there for occupancy in all_related(each.hidden, case_set)]
     if not occupancies:
         return None
-    if any(occupancy.lease is not None for occupancy in occupancies):
-        return because("being_put_off")
+    if any(each.lease is not None for each in occupancies):
+        return because("scoring")
     return because("to_report")
 
 
@@ -125,37 +121,12 @@ def adoptable(state: State, job: JobState, worker: Worker) -> bool:
         return True
     if job.priority == TRAIN:
         there = [occupancy for each in here for occupancy in all_related(each.hidden, case_set)]
-    elif hidden_conflict(state, case_set, worker.kernel) in ("kernel", "agent", "asked"):
+    elif hidden_conflict(state, case_set, worker.kernel) in ("kernel", "agent"):
         return False
     else:
         there = [occupancy for each in here for occupancy in all_related(each.train, case_set)]
     # This worker's own lingering occupancies do not count: its heartbeat names every lease that it holds.
     return all(occupancy.lease is None and occupancy.worker == worker.name for occupancy in there)
-
-
-def goes_first(lease: Lease) -> bool:
-    """Whether a hidden lease is on a kernel that is reserved for it."""
-    occupancy = lease.occupancy
-    return (
-        occupancy is not None
-        and lease.job.priority != EARLY_VALIDATION
-        and related(occupancy.kernel.reversals, occupancy.case_set) is not None
-    )
-
-
-def to_clear(state: State, case_set: CaseSet | None) -> list[tuple[Kernel, list[Lease]]]:
-    """The kernels where related hidden jobs bar a case set's train jobs, each with the live leases to stop there; those
-    with the fewest first. The list of leases is empty where all were stopped but not all are released yet."""
-    barring = []
-    kernels: dict[Kernel, None] = {}
-    if state.isolates and case_set is not None:
-        kernels = {kernel: None for each in case_set.relatives for kernel in each.hidden_on}
-    for kernel in kernels:
-        occupancies = all_related(kernel.hidden, case_set)
-        if occupancies and not reversed_there(state, kernel, case_set):
-            playing = [each.lease for each in occupancies if each.lease is not None and each.lease.live]
-            barring.append((kernel, playing))
-    return sorted(barring, key=lambda each: len(each[1]))
 
 
 # ---- reasons ----

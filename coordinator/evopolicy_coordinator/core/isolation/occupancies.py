@@ -18,7 +18,7 @@ from evopolicy_coordinator.core.contract.records import KernelRow
 from evopolicy_coordinator.core.isolation import kernels
 from evopolicy_coordinator.core.isolation.kernels import put, related
 from evopolicy_coordinator.core.structures import take
-from evopolicy_coordinator.core.tables.model import Lease, Occupancies, Occupancy, Worker, add
+from evopolicy_coordinator.core.tables.model import Lease, Occupancies, Occupancy, Worker
 from evopolicy_coordinator.core.tables.state import State
 from evopolicy_coordinator.core.tables.step import Step
 
@@ -40,8 +40,6 @@ def _enter(occupancy: Occupancy) -> None:
     case_set = occupancy.case_set
     if case_set is not None:
         case_set.users += 1
-        if occupancy.hidden:
-            add(case_set.hidden_on, occupancy.kernel, 1)
     put(_index(occupancy), case_set, occupancy.key, occupancy)
 
 
@@ -65,8 +63,6 @@ def _gone(state: State, occupancy: Occupancy, step: Step) -> None:
     """Remove an ended occupancy, and mark the work that it barred."""
     index, case_set = _index(occupancy), occupancy.case_set
     take(index, case_set, occupancy.key)
-    if occupancy.hidden and case_set is not None:
-        add(case_set.hidden_on, occupancy.kernel, -1)
     if not related(index, case_set):
         kernels.freed(state, case_set, step, train_too=occupancy.hidden)
     kernels.tidy(state, occupancy.kernel)

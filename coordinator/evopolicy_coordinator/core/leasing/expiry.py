@@ -40,8 +40,6 @@ def check_due(state: State, name: str, step: Step) -> None:
         if now >= overdue and lease.live:
             leases.stop(state, lease, step)
             leases.give_back(state, lease.job, "overdue", worker, step, ran=True)
-        elif now >= overdue and lease.parting:
-            leases.parted(state, lease, worker, step)
         elif now >= due:
             live, orphan = lease.live, lease.orphan_until is not None
             leases.release(state, worker, lease, step)
@@ -49,7 +47,7 @@ def check_due(state: State, name: str, step: Step) -> None:
                 failure: JobFailure = "worker_lost" if orphan else "unlisted"
                 leases.give_back(state, lease.job, failure, worker, step, ran=orphan and lease.id in running)
         else:
-            deadlines.append(min(due, overdue) if lease.live or lease.parting else due)
+            deadlines.append(min(due, overdue) if lease.live else due)
     if deadlines:
         state.timers.arm(("worker", worker.name), min(deadlines))
 

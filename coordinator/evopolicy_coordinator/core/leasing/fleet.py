@@ -122,7 +122,7 @@ def _drop_profiles(state: State) -> None:
     """Forget profiles that no worker has. A worker may come with another one each time."""
     used = {worker.profile for worker in state.workers.values()}
     for profile in list(state.profiles.values()):
-        if profile not in used and not any(profile.hidden):
+        if profile not in used:
             queue.drop_profile(state, profile)
 
 

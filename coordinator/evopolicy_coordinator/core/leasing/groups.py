@@ -18,6 +18,7 @@ from evopolicy_coordinator.core.tables.step import Step
 def open_group(state: State, group: JobGroup, step: Step) -> None:
     """Queue the unfinished jobs of a group. While the core is loaded, jobs first wait to be adopted."""
     state.groups[group.id] = group
+    group.flow.n_hidden += group.hidden
     loading, heads = state.loading, []
     if loading is not None:
         heads = loading.heads.pop(group.id, [])
@@ -66,6 +67,7 @@ def close_group(state: State, group: JobGroup, step: Step) -> None:
     for job in list(group.jobs.values()):
         close_job(state, job, step)
     group.closed = True
+    group.flow.n_hidden -= group.hidden
     leases.let_go(state, group, step.now)
     state.groups.pop(group.id, None)
     state.timers.disarm(("submit", group.id))
@@ -75,7 +77,6 @@ def close_job(state: State, job: JobState, step: Step) -> None:
     """Stop and remove an open job."""
     if job.lease is not None:
         leases.stop(state, job.lease, step)
-    job.parting = None
     queue.withdraw(state, job)
     fleet.unreserve(state, job)
     state.adopting.pop(job, None)
@@ -83,22 +84,3 @@ def close_job(state: State, job: JobState, step: Step) -> None:
     job.move("closed")
     del job.group.jobs[job.first]
     del state.jobs[job.job_id]
-
-
-def promote(state: State, group: JobGroup, priority: int, step: Step) -> None:
-    """Move a group's open jobs to another priority."""
-    if group.priority == priority:
-        return
-    group.priority = priority
-    for job in group.jobs.values():
-        queued = job.queued
-        queue.withdraw(state, job)
-        if job.lease is not None:
-            held = state.workers[job.lease.worker].held
-            held[job.priority] -= 1
-            held[priority] += 1
-        job.priority = priority
-        if queued:
-            queue.put(state, job, step)
-        elif job.lease is not None:
-            leases.list_hidden(state, job.lease, state.workers[job.lease.worker], step)

@@ -8,8 +8,7 @@ Rules that this module owns:
 - Heartbeats that name a lease keep it alive. A lease that never arrived at its worker is given up.
 - A lease that this incarnation did not grant is adopted from its holder's heartbeat if its job waits.
 - Giving up a job's lease puts the job back as `retry` decides; only jobs that ran are blamed.
-- A policy's job that is stopped without a failure returns to the queue only after its worker has released it: the
-  worker returns the policy's actions so far, and the next attempt plays them first.
+- A worker that stops a policy's hidden job returns the policy's actions so far, and the next attempt plays them first.
 """
 
 from __future__ import annotations
@@ -23,7 +22,7 @@ from evopolicy_coordinator.core.isolation import conflicts, occupancies
 from evopolicy_coordinator.core.leasing import fleet, queue
 from evopolicy_coordinator.core.leasing.jobs import build
 from evopolicy_coordinator.core.leasing.retry import JobFailure, decide
-from evopolicy_coordinator.core.tables.model import TRAIN, JobGroup, JobState, Lease, Worker
+from evopolicy_coordinator.core.tables.model import JobGroup, JobState, Lease, Worker
 from evopolicy_coordinator.core.tables.state import State
 from evopolicy_coordinator.core.tables.step import JobRetried, Step
 
@@ -75,7 +74,7 @@ def _enter(state: State, job: JobState, worker: Worker, attempt: int, step: Step
     now = step.now
     name = lease_id(job.group.flow.secret, job.job_id, attempt, worker.name)
     lease = Lease(name, job, worker.name, attempt, granted_at=now, renewed=now, progress_at=now)
-    job.lease, job.parting = lease, None
+    job.lease = lease
     job.move("leased")
     worker.leases[name] = lease
     worker.n_live += 1
@@ -86,7 +85,6 @@ def _enter(state: State, job: JobState, worker: Worker, attempt: int, step: Step
     state.n_live += 1
     occupancies.leased(state, lease, worker, serial, step)
     let_go(state, group, now)
-    list_hidden(state, lease, worker, step)
     if group.first_leased_at is None:
         group.first_leased_at = now
         limit_s = group.template.limits.submit_wall_s
@@ -96,21 +94,6 @@ def _enter(state: State, job: JobState, worker: Worker, attempt: int, step: Step
         worker.alone = lease
     state.timers.arm_once(("worker", worker.name), now + state.settings.lease_ttl_s)
     return lease
-
-
-def list_hidden(state: State, lease: Lease, worker: Worker, step: Step) -> None:
-    """List a live lease among those that train jobs may preempt, by its job's priority."""
-    if lease.hidden_in is not None:
-        lease.hidden_in.pop(lease, None)
-        lease.hidden_in = None
-    if lease.job.priority != TRAIN:
-        lease.hidden_in = worker.profile.hidden[lease.job.priority]
-        lease.hidden_in[lease] = None
-        # Train jobs that wait already (they avoided the worker, or the hidden job was adopted from its
-        # heartbeat) may stop it without any further event.
-        for lane in worker.profile.busy:
-            if lane.n_ready[TRAIN]:
-                state.timers.arm_once(("lane", lane.key), step.now + queue.RECHECK_S)
 
 
 def let_go(state: State, group: JobGroup, now: float) -> None:
@@ -137,7 +120,7 @@ def hear(
         lease = worker.leases.get(item.lease_id) or _adopt(state, worker, item, step)
         if lease is None:
             occupancies.unknown(state, worker, item, step)
-        elif lease.live or lease.parting:
+        elif lease.live:
             lease.doubtful = lease.doubtful or now - lease.renewed > state.settings.silence_s
             lease.renewed = now
             lease.orphan_until = None
@@ -153,9 +136,7 @@ def hear(
     missing_since = now - MISSING_BEATS * state.settings.heartbeat_s
     for lease in [each for each in worker.leases.values() if each.id not in named]:
         if not lease.live:
-            sure = occupancies.surely(worker, lease.occupancy, settled)
-            if sure or not lease.parting:
-                _leave(state, worker, lease, step, sure=sure)
+            _leave(state, worker, lease, step, sure=occupancies.surely(worker, lease.occupancy, settled))
         elif not lease.named and lease.granted_at < missing_since and now >= state.hold_until:
             sure = occupancies.surely(worker, lease.occupancy, settled)
             release(state, worker, lease, step, sure=sure)
@@ -201,8 +182,6 @@ def end(state: State, lease: Lease) -> None:
     worker = state.workers[lease.worker]
     worker.n_live -= 1
     worker.held[job.priority] -= 1
-    if lease.hidden_in is not None:
-        lease.hidden_in.pop(lease, None)
 
 
 def stop(state: State, lease: Lease, step: Step) -> None:
@@ -222,20 +201,9 @@ def release(state: State, worker: Worker, lease: Lease, step: Step, *, sure: boo
 def _leave(state: State, worker: Worker, lease: Lease, step: Step, *, sure: bool) -> None:
     worker.leases.pop(lease.id, None)
     occupancies.vacate(state, lease, worker, step, sure=sure)
-    if lease.stopped_for is not None:
-        lease.stopped_for.stopping -= 1
-        lease.stopped_for = None
     if worker.alone is lease:
         worker.alone = None
     state.freed[worker.name] = None
-    parted(state, lease, worker, step)
-
-
-def parted(state: State, lease: Lease, worker: Worker, step: Step) -> None:
-    """Put a job back that waited for its worker's release."""
-    if lease.parting:
-        lease.job.parting = None
-        give_back(state, lease.job, "returned", worker, step, ran=False)
 
 
 def give_back(
@@ -274,15 +242,3 @@ def give_back(
         state.timers.arm(("job", job.job_id), step.now + retry.delay_s)
     else:
         queue.put(state, job, step, front=True)
-
-
-def put_off(state: State, lease: Lease, step: Step) -> None:
-    """Stop a hidden job without a failure. It returns to the queue, but a policy's job only after its
-    worker has released it."""
-    job = lease.job
-    stop(state, lease, step)
-    if job.group.template.bundle is None:
-        give_back(state, job, "returned", state.workers[lease.worker], step, ran=False)
-    else:
-        job.move("parting")
-        job.since, job.parting = step.now, lease

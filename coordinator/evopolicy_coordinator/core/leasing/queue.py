@@ -5,7 +5,8 @@ Rules that this module owns:
   until it is pinned to a class.
 - Priorities of an earlier rank (`RANKS`) go first, whatever the shares are.
 - Between flows of one rank the one with the least play time goes first (start-time fair queueing: each rank has a
-  virtual clock; an idle flow starts at the clock, so that idleness earns nothing). A worker that has the environment or
+  virtual clock, which each lease moves on by its part of a flow's share; an idle flow starts at the clock, so that
+  idleness earns nothing, and new flows without end keep no other waiting). A worker that has the environment or
   the bundle warm may deviate from this by a bounded amount.
 - Within a flow jobs go in order; jobs that return after a failure go to the front.
 - A job is not leased to a worker that it avoids while its lane has another one.
@@ -19,7 +20,6 @@ from collections.abc import Collection
 
 from evopolicy_coordinator.core.isolation import conflicts
 from evopolicy_coordinator.core.tables.model import (
-    HIDDEN,
     HIDDEN_FIRST,
     N_PRIORITIES,
     RANKS,
@@ -28,7 +28,6 @@ from evopolicy_coordinator.core.tables.model import (
     Lane,
     Profile,
     Worker,
-    add,
 )
 from evopolicy_coordinator.core.tables.state import State
 from evopolicy_coordinator.core.tables.step import Step
@@ -92,18 +91,6 @@ def place(state: State, flow: Flow, pin: str) -> Lane:
             _enter(flow, lane, priority)
     _settle(lane)
     return lane
-
-
-def close(state: State, flow: Flow) -> None:
-    """Mark a flow as closed: its agent is gone."""
-    waiting = {
-        priority: flow.n_ready[priority]
-        + sum(job.group.flow is flow and job.priority == priority for job in state.suspects)
-        for priority in HIDDEN
-    }
-    flow.closed = True
-    if flow.lane is not None and flow.case_set is not None:
-        add(flow.lane.backlog, flow.case_set, sum(waiting.values()))
 
 
 def _join(profile: Profile, lane: Lane) -> None:
@@ -235,8 +222,9 @@ def open_to(state: State, lane: Lane, priority: int, worker: Worker) -> bool:
 def _serve(state: State, job: JobState) -> None:
     flow, priority = job.group.flow, job.priority
     withdraw(state, job)
-    state.clock[_RANK[priority]] = max(state.clock[_RANK[priority]], flow.served[priority])
-    flow.served[priority] += flow.cost_s(job)
+    clock, cost_s = max(state.clock[_RANK[priority]], flow.served[priority]), flow.cost_s(job)
+    state.clock[_RANK[priority]] = clock + cost_s / (len(state.runs) + len(state.evaluations))
+    flow.served[priority] += cost_s
 
 
 def _best(
@@ -306,7 +294,7 @@ def next_bundle(lane: Lane) -> tuple[str | None, str] | None:
 
 
 def _ranks(worker: Worker) -> tuple[tuple[int, ...], ...]:
-    return HIDDEN_FIRST if worker.kernel.reversals else RANKS
+    return HIDDEN_FIRST if worker.kernel.reservations else RANKS
 
 
 def _next(flow: Flow, priority: int) -> JobState:

@@ -4,7 +4,7 @@ Rules that this module owns:
 - Only infrastructure failures are retried, without limit. A policy's failure is a result and never handled here.
 - Only an environment that keeps ending the same job is given up: after `FAULTS_MAX` attempts in at least
   `CoreSettings.environment_wait_s`, on two machines if two can play it, so that no machine's word alone ends a run.
-- A job that is given back (drained, preempted, cancelled) has not failed: no delay, no blame.
+- A job that is given back (drained, cancelled) has not failed: no delay, no blame.
 - The jobs that ran on a lost worker become suspects and rerun alone. The jobs that waited there behind them just return
   to the queue.
 """

@@ -51,7 +51,7 @@ def enter(state: State, row: EvaluationRow) -> Evaluation:
     hidden = templates.hidden_evaluation(row)
     case_set = state.case_sets.join(row.env, (*row.cases, *row.related)) if hidden else None
     flow = Flow(row.evaluation, row.env, row.tier, "evaluation", row.secret)
-    flow.case_set, flow.closed, flow.definition = case_set, True, row.definition
+    flow.case_set, flow.definition = case_set, row.definition
     pins.add_flow(state, flow)
     evaluation = state.evaluations[row.evaluation] = Evaluation(row, flow)
     state.evaluation_keys[row.key] = row.evaluation

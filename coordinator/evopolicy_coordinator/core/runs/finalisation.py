@@ -1,8 +1,8 @@
 """The stages of a run that takes no more submits: validation, selection, held-out, the random reference.
 
 Rules that this module owns:
-- Every ok checkpoint is validated on all hidden validation cases. Validation starts as soon as the checkpoint is ok, in
-  idle slots, and is never played twice: an outcome is stored under (run, submit, split, index), which fixes bundle,
+- Every ok checkpoint is validated on all hidden validation cases. Validation starts when the run has
+  closed, and is never played twice: an outcome is stored under (run, submit, split, index), which fixes bundle,
   env_meta, case, scope and policy seed, in a run that is pinned to one fingerprint class.
 - Selection waits until every ok checkpoint is validated or ineligible. The highest mean wins, a tie goes to the later
   submit.
@@ -27,7 +27,7 @@ from evopolicy_coordinator.core.contract.records import (
     random_group,
     submit_group,
 )
-from evopolicy_coordinator.core.leasing import groups, queue
+from evopolicy_coordinator.core.leasing import groups
 from evopolicy_coordinator.core.runs import (
     evaluations,
     finished,
@@ -36,7 +36,7 @@ from evopolicy_coordinator.core.runs import (
     runs,
     templates,
 )
-from evopolicy_coordinator.core.tables.model import HELDOUT, JobGroup, Run
+from evopolicy_coordinator.core.tables.model import JobGroup, Run
 from evopolicy_coordinator.core.tables.state import State
 from evopolicy_coordinator.core.tables.step import (
     AgentOverdue,
@@ -50,12 +50,6 @@ FAILED_VALIDATION = "its policy failed in a validation episode"
 """`SubmitRow.ineligible` of a checkpoint with "end-submit"."""
 
 # ---- hidden groups ----
-
-
-def validate(state: State, run: Run, row: SubmitRow, step: Step) -> None:
-    """Queue the validation of an ok checkpoint; in idle slots only while the run is open."""
-    if submit_group(run.id, row.submit_index, "validation") not in state.groups:
-        _open(state, templates.hidden("validation", run, row, step), step)
 
 
 def _open(state: State, group: JobGroup, step: Step) -> None:
@@ -82,9 +76,7 @@ def progressed(state: State, news: EpisodesDone, step: Step) -> None:
 
 
 def submit_ended(state: State, news: SubmitEnded, step: Step) -> None:
-    """A submit got its verdict: its hidden validation may start, and a closed run may advance."""
-    if news.row.status == "ok":
-        validate(state, news.run, news.row, step)
+    """A submit got its verdict: a closed run may advance."""
     advance(state, news.run, step)
 
 
@@ -104,7 +96,6 @@ def close(state: State, event: events.Requested[gateway.CloseRun], step: Step) -
         step.change_run(
             run, phase="closed", closed_at=step.now, close_reason=message.reason, agent=message.agent
         )
-        queue.close(state, run.flow)
         step.log("info", "run_closed", run=run.id, reason=message.reason, submits=len(run.submits))
         advance(state, run, step)
     step.reply(event.request, gateway.RunClosed())
@@ -123,10 +114,7 @@ def advance(state: State, run: Run, step: Step) -> None:
         _open(state, templates.random(run, step), step)
     waiting = [row for row in finished.ok_submits(run) if row.val_mean is None and row.ineligible is None]
     for row in waiting:
-        validate(state, run, row, step)
-        groups.promote(
-            state, state.groups[submit_group(run.id, row.submit_index, "validation")], HELDOUT, step
-        )
+        _open(state, templates.hidden("validation", run, row, step), step)
     if waiting:
         return
     best = finished.select(run)

@@ -66,7 +66,6 @@ def enter(state: State, row: RunRow, stored: RunStateRow) -> Run:
         "run",
         row.secret,
         case_set=state.case_sets.join(settings.env, (*row.validation, *row.heldout, *row.related)),
-        closed=stored.phase != "open",
         definition=settings.definition,
     )
     pins.add_flow(state, flow)

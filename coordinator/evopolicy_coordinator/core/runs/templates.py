@@ -20,8 +20,7 @@ from evopolicy_coordinator.core.contract.records import (
 )
 from evopolicy_coordinator.core.leasing.jobs import occurrences
 from evopolicy_coordinator.core.tables.model import (
-    EARLY_VALIDATION,
-    HELDOUT,
+    HIDDEN,
     REFERENCE,
     TRAIN,
     Evaluation,
@@ -64,7 +63,6 @@ def hidden(split: Literal["validation", "heldout"], run: Run, row: SubmitRow, st
     """A checkpoint on all cases of a hidden split."""
     settings, cases = run.row.settings, getattr(run.row, split)
     pool = settings.hidden_evaluation == "pool"
-    early = split == "validation" and run.state.phase == "open"
     return _group(
         split,
         run,
@@ -72,7 +70,7 @@ def hidden(split: Literal["validation", "heldout"], run: Run, row: SubmitRow, st
         step,
         id=submit_group(run.id, row.submit_index, split),
         submit_index=row.submit_index,
-        priority=EARLY_VALIDATION if early else HELDOUT,
+        priority=HIDDEN,
         stimulus_id=row.stimulus_id,
         env_meta=env_meta(run, row) | ({"remaining_budget_after": 0} if pool else {}),
         bundle=row.bundle,
@@ -113,7 +111,7 @@ def evaluation(of: Evaluation, step: Step) -> JobGroup:
         step,
         id=evaluation_group(row.evaluation),
         submit_index=place.submit_index,
-        priority=HELDOUT if hidden_evaluation(row) else REFERENCE,
+        priority=HIDDEN if hidden_evaluation(row) else REFERENCE,
         stimulus_id=row.stimulus_id,
         created_at=row.created_at,
         env_meta={

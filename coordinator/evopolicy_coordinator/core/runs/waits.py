@@ -20,8 +20,6 @@ def waits_for(state: State, group: JobGroup) -> Reason | None:
         return missing
     if obstacle := conflicts.obstacle(state, group):
         return obstacle
-    if any(job.place == "parting" for job in group.jobs.values()):
-        return because("hand_back")
     if any(job.lease is None and not job.queued for job in group.jobs.values()):
         waits_to_adopt = any(job in state.adopting for job in group.jobs.values())
         return because("adoption" if waits_to_adopt else "own_fault")

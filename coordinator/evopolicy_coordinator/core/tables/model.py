@@ -49,19 +49,16 @@ T = TypeVar("T")
 # ---- jobs ----
 
 
-TRAIN, REFERENCE, HELDOUT, EARLY_VALIDATION = range(4)
-"""Priorities. Validation of a closed run and evaluations on hidden cases have `HELDOUT`, the random reference and other
-evaluations `REFERENCE`."""
-N_PRIORITIES = 4
-PRIORITY_NAMES = ("train", "reference", "heldout", "validation")
+TRAIN, REFERENCE, HIDDEN = range(3)
+"""Priorities. `HIDDEN`: a policy's present or recorded actions on hidden cases, never played on a kernel with an agent
+that could learn of them (`isolation`). `REFERENCE`: the random reference and other evaluations."""
+N_PRIORITIES = 3
+PRIORITY_NAMES = ("train", "reference", "hidden")
 """As `QueuedJobs.priority`."""
-RANKS = ((TRAIN,), (REFERENCE, HELDOUT), (EARLY_VALIDATION,))
+RANKS = ((TRAIN,), (REFERENCE, HIDDEN))
 """Each rank of priorities gets fair shares of what the ranks before it leave."""
-HIDDEN_FIRST = ((HELDOUT,), (TRAIN,), (REFERENCE,), (EARLY_VALIDATION,))
+HIDDEN_FIRST = ((HIDDEN,), (TRAIN,), (REFERENCE,))
 """The same on a kernel that is reserved for hidden jobs (`agents.precedence`)."""
-HIDDEN = frozenset((HELDOUT, EARLY_VALIDATION))
-"""Jobs with a policy's present or recorded actions on hidden cases: never on a kernel with an agent that could learn
-of them (`isolation`)."""
 
 
 def by_priority(make: Callable[[], Any]) -> list[Any]:
@@ -167,7 +164,6 @@ class JobState:
     """It is a suspect: played with no other job beside it."""
     reserved: str | None = None
     """The worker that is being emptied for it, if it is a suspect."""
-    preemptions: int = 0
     since: float = 0.0
     """When its present wait began."""
     held_attempts: set[int] = field(default_factory=set)
@@ -177,8 +173,6 @@ class JobState:
     first. None for none."""
     begun_attempt: int = 0
     """The attempt that reported them."""
-    parting: Lease | None = None
-    """The stopped lease, until its worker releases it."""
 
     @property
     def queued(self) -> bool:
@@ -235,7 +229,7 @@ class JobGroup:
 
     @property
     def hidden(self) -> bool:
-        return self.priority in HIDDEN
+        return self.priority == HIDDEN
 
     @property
     def n(self) -> int:
@@ -294,23 +288,14 @@ class Lease:
     steps: int = 0
     progress_at: float = 0.0
     live: bool = True
-    """False once the lease was preempted, cancelled, or has expired, or its job is done."""
+    """False once the lease was cancelled or has expired, or its job is done."""
     orphan_until: float | None = None
     """Its session ended; a heartbeat may claim it until then."""
     doubtful: bool = False
     """Its holder was silent for long, or this incarnation did not grant it: a limit verdict may be caused by the
     silence, and does not count."""
-    hidden_in: dict[Lease, None] | None = None
-    """The list of preemptible leases that holds it."""
-    stopped_for: Lane | None = None
-    """The lane whose train jobs it was preempted for."""
     occupancy: Occupancy | None = None
     """Its place on a kernel, if it is hidden or train, until its worker releases it."""
-
-    @property
-    def parting(self) -> bool:
-        """Whether its job waits until the worker releases this lease."""
-        return self.job.parting is self
 
 
 # ---- queues ----
@@ -337,8 +322,10 @@ class Flow:
     """Order of creation: breaks ties."""
     case_set: CaseSet | None = None
     """Runs and evaluations with the same hidden cases; None if it has none."""
-    closed: bool = False
-    """No agent works for it: its hidden jobs wait for agents for a limited time only (`agents.precedence`)."""
+    n_hidden: int = 0
+    """Its open groups of hidden jobs."""
+    kept_s: float = 0.0
+    """Seconds for which its hidden jobs were kept from all kernels (`agents.precedence`)."""
     definition: str = ""
     """First digits of the digest of the environment definition that it needs; empty: any."""
     pin: str | None = None
@@ -372,29 +359,20 @@ class Lane:
     n_ready: list[int] = field(default_factory=partial(by_priority, int))
     waiting: list[dict[CaseSet | None, int]] = field(default_factory=partial(by_priority, dict))
     """Waiting jobs, suspects included, by priority and case set."""
-    backlog: dict[CaseSet, int] = field(default_factory=dict)
-    """The hidden ones of closed flows among them."""
-    kept_s: dict[CaseSet, float] = field(default_factory=dict)
-    """Seconds for which such jobs were kept from all kernels, since there last were none."""
-    done_checks: dict[CaseSet, int] = field(default_factory=dict)
-    reversals: dict[CaseSet, Reversal] = field(default_factory=dict)
+    reservations: dict[CaseSet, Reservation] = field(default_factory=dict)
     checked_at: float = 0.0
     profiles: dict[Profile, None] = field(default_factory=dict)
-    stopping: int = 0
-    """Hidden jobs that were stopped for this lane and that their workers have not released yet."""
 
     def count(self, priority: int, flow: Flow, n: int) -> None:
         """Add `n` to the waiting jobs of a flow."""
         add(self.waiting[priority], flow.case_set, n)
-        if flow.closed and priority in HIDDEN and flow.case_set is not None:
-            add(self.backlog, flow.case_set, n)
 
     def waits_of(self, case_set: CaseSet | None, *, train_too: bool) -> bool:
         """Whether related hidden jobs wait (of any case set for None) and no related train jobs that they leave the
         kernel to; with `train_too`, whether related jobs of either kind wait."""
         if _of(self.waiting[TRAIN], case_set):
             return train_too
-        return any(_of(self.waiting[priority], case_set) for priority in HIDDEN)
+        return _of(self.waiting[HIDDEN], case_set)
 
     def slots(self) -> int:
         """Slots of the active workers that may serve it."""
@@ -445,8 +423,6 @@ class Profile:
     """Workers whose lease poll waits and could be answered now, oldest first."""
     warm: dict[str, dict[str, None]] = field(default_factory=dict)
     """Warm environment or bundle digest to the workers in `parked` that have it."""
-    hidden: list[dict[Lease, None]] = field(default_factory=partial(by_priority, dict))
-    """Live leases of its workers that may be preempted, by priority, oldest first."""
 
     def offers(self, flow: Flow) -> bool:
         """Whether these workers have a flow's environment, its definition, and its sandbox tier."""
@@ -490,8 +466,6 @@ class CaseSet:
     relatives: dict[CaseSet, None] = field(default_factory=dict)
     """Case sets that share a case with it, itself included."""
     users: int = 0
-    hidden_on: dict[Kernel, int] = field(default_factory=dict)
-    """Kernel to the number of its hidden jobs there."""
     lanes: dict[Lane, None] = field(default_factory=dict)
     """Lanes in which its jobs wait, or have waited."""
 
@@ -532,12 +506,13 @@ class Ask(NamedTuple):
     kernel: Kernel
 
 
-class Reversal(NamedTuple):
-    """Hidden jobs of a case set have precedence on a kernel."""
+class Reservation(NamedTuple):
+    """A kernel is reserved for the hidden jobs of these flows."""
 
     kernel: Kernel
     lane: Lane
     case_set: CaseSet
+    flows: dict[Flow, None]
 
 
 @dataclass(slots=True, eq=False)
@@ -551,7 +526,7 @@ class Kernel:
     asks: dict[CaseSet | None, dict[str, Ask]] = field(default_factory=dict)
     hidden: Occupancies = field(default_factory=dict)
     train: Occupancies = field(default_factory=dict)
-    reversals: dict[CaseSet | None, dict[str, Reversal]] = field(default_factory=dict)
+    reservations: dict[CaseSet | None, dict[str, Reservation]] = field(default_factory=dict)
 
 
 # ---- workers ----
@@ -599,6 +574,8 @@ class Worker:
     n_live: int = 0
     """Live leases in all."""
     poll: LeasePoll | None = None
+    polled_at: float | None = None
+    """When it last polled; None for never."""
     beat: RequestId | None = None
     """A heartbeat whose reply is delayed."""
     doubted_at: float | None = None

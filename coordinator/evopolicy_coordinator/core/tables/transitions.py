@@ -23,13 +23,12 @@ RUN: Table = {
 SUBMIT: Table = {"open": get_args(SubmitStatus), **dict.fromkeys(get_args(SubmitStatus), ())}
 """An open submit gets any verdict, once; `open` is a status of None."""
 
-Place = Literal["new", "queued", "leased", "parting", "backing_off", "adopting", "closed"]
+Place = Literal["new", "queued", "leased", "backing_off", "adopting", "closed"]
 
 JOB: Table = {
     "new": ("queued", "adopting"),  # adopting: it may have been running since before the core was loaded
-    "queued": ("queued", "leased", "closed"),  # queued: at another priority
-    "leased": ("queued", "parting", "backing_off", "closed"),
-    "parting": ("queued", "leased", "closed"),  # its lease was stopped; its worker has yet to release it
+    "queued": ("leased", "closed"),
+    "leased": ("queued", "backing_off", "closed"),
     "backing_off": ("queued", "leased", "closed"),  # leased: adopted from its worker's heartbeat
     "adopting": ("queued", "leased", "closed"),
     "closed": (),

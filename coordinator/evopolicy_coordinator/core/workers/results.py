@@ -2,8 +2,8 @@
 
 Rules that this module owns:
 - A job's outcome is committed from any attempt while the job is open; the first to arrive wins. A limit verdict counts
-  only from the live attempt, or from a stopped one that its worker has not released yet, and only if its worker was
-  never silent for long and this process was never blocked during it; otherwise a frozen worker would blame the policy.
+  only from the live attempt, and only if its worker was never silent for long and this process was never blocked
+  during it; otherwise a frozen worker would blame the policy.
   An attempt whose verdict does not count is played again.
 - A later outcome of the same episode is only compared; a difference is reported as nondeterminism.
 - The actions that the policy of a given-back attempt had returned stand: no later attempt gives the policy a second
@@ -52,7 +52,6 @@ def take(state: State, news: ResultsPersisted, step: Step) -> None:
         _closed(state, worker, lease, result, step, granted=granted)
         return
     live = lease is not None and lease.live and job.lease is lease
-    counts = live or (lease is not None and lease.parting)
     silent = lease is None or _silent(state, lease, step.now)
     leased_s = None if lease is None else step.now - lease.granted_at
     if result.kind != "done":
@@ -60,7 +59,7 @@ def take(state: State, news: ResultsPersisted, step: Step) -> None:
     if lease is not None:
         leases.release(state, worker, lease, step, sure=True)
     if result.kind == "done":
-        silent = silent or not counts
+        silent = silent or not live
         _done(state, worker, job, result, step, live=live, silent=silent, leased_s=leased_s)
     elif live:
         if result.kind != "returned" and not result.environment_fault:

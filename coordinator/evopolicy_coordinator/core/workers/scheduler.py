@@ -21,10 +21,10 @@ from evopolicy_common.messages import worker as wire
 from evopolicy_coordinator.core.agents import permits, precedence
 from evopolicy_coordinator.core.contract.events import Requested
 from evopolicy_coordinator.core.leasing import fleet, leases, queue
-from evopolicy_coordinator.core.tables.model import TRAIN, Lane, LeasePoll, Worker
+from evopolicy_coordinator.core.tables.model import Lane, LeasePoll, Worker
 from evopolicy_coordinator.core.tables.state import State
 from evopolicy_coordinator.core.tables.step import Step
-from evopolicy_coordinator.core.workers import preemption
+from evopolicy_coordinator.core.workers import suspects
 
 PREFETCH_BELOW_S = 1.0
 """Longer episodes are leased to free slots only: the time to fetch them is negligible beside their play time."""
@@ -49,6 +49,7 @@ def poll(state: State, worker: Worker, event: Requested[wire.LeaseRequest], step
     """A worker polls for leases; an older poll of it is answered with none."""
     message = event.message
     fleet.drop_poll(state, worker, step)
+    worker.polled_at = step.now
     if message.n < 1 or event.waited_s > message.wait_s + state.settings.late_s:
         step.reply(event.request, wire.Leases(leases=()))
         return
@@ -89,7 +90,7 @@ def _fill(state: State, worker: Worker, step: Step) -> list[wire.Lease]:
         return []
     if step.now > poll.until + state.settings.late_s:
         return []
-    if state.suspects and (suspect := preemption.next_suspect(state, worker, step)) is not None:
+    if state.suspects and (suspect := suspects.next_suspect(state, worker, step)) is not None:
         return [suspect]
     if worker.reserved is not None:
         return []
@@ -147,27 +148,16 @@ def dispatch(state: State, step: Step) -> None:
     for lane in fed:
         _feed(state, lane, step)
     for lane in fed:
-        if lane.n_ready[TRAIN]:
-            preemption.preempt(state, lane, step)
-    while step.dirty:
-        # Jobs that were stopped just now wait again: another worker may have a slot for them.
-        lane = next(iter(step.dirty))
-        del step.dirty[lane]
-        _feed(state, lane, step)
-    for lane in fed:
         precedence.watch(state, lane, step)
     for name, stops in step.stops.items():
         _tell(state, name, tuple(stops), step)
 
 
 def _place_suspects(state: State, step: Step) -> None:
-    """Let hidden jobs make room for waiting suspects, and offer the suspects to idle workers."""
-    for job in list(islice(state.suspects, preemption.SUSPECTS_MAX)):
+    """Offer waiting suspects to idle workers."""
+    for job in list(islice(state.suspects, suspects.SUSPECTS_MAX)):
         lane = job.group.flow.lane
         if lane is not None and job.queued:
-            if job.priority == TRAIN:
-                avoided = job.avoid if step.now < job.avoid_until and lane.workers() > 1 else None
-                preemption.clear(state, lane, job.group.flow.case_set, avoided, step)
             for profile in lane.profiles:
                 for name in list(islice(profile.parked, TRIES_MAX)):
                     worker = state.workers[name]

@@ -41,8 +41,7 @@ STATES = {
 }
 _PRIORITIES = {
     "reference": "random reference, evaluation",
-    "heldout": "held-out, final validation",
-    "validation": "early validation",
+    "hidden": "validation, held-out, hidden evaluation",
 }
 
 

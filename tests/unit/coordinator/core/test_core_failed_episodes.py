@@ -62,11 +62,16 @@ def test_a_failed_heldout_episode_leaves_the_run_without_a_score() -> None:
 
 
 def test_an_excluded_checkpoint_stays_excluded_after_a_restart(rig: Rig) -> None:
-    session = rig.begin(0, 1, run={"failed_episodes": "end-submit", "budget": 2})
-    play_off(rig, session, lambda job: (1.0, split_of(job) == "validation"))
+    session = rig.begin(0, 1, run={"failed_episodes": "end-submit", "budget": 2, "n_held": 9})
+    play_off(rig, session, lambda job: (1.0, False))
+    rig.close()
+    while rig.row(SubmitRow, "r1", 0).ineligible is None:
+        for lease in rig.poll(session, 8):
+            failure = FAILURE if split_of(lease.job) == "validation" else None
+            rig.report_results(session, done(lease, 1.0, failure))
     rig.load()
     session = rig.register()
-    rig.close()
+    rig.pass_time(rig.settings.adoption_s)
     play_off(rig, session, lambda job: (1.0, False))
     assert rig.finished().status == "no_ok_submit"
 

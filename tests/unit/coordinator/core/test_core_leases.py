@@ -259,21 +259,6 @@ def test_a_worker_emptied_for_a_suspect_claimed_elsewhere_works_again() -> None:
     assert len(rig.poll(third, 1)) == 1
 
 
-def test_a_train_suspect_does_not_wait_for_hidden_jobs() -> None:
-    rig, (first, second), lease = one_job("w1", "w2")
-    rig.create("r2", n_valid=2)
-    rig.submit(0, run="r2", key="x")
-    rig.play(second, *rig.poll(second, 1))
-    hidden = rig.poll(second, 2)
-    rig.beat(first, lease)
-    keep(rig, 18.0, (second, tuple(hidden)))
-    assert rig.core.state.workers["w1"].state == "lost"
-    assert rig.poll(second, 2) == []  # it is emptied for the suspect
-    assert set(rig.beat(second, *hidden).cancelled) == {each.lease_id for each in hidden}
-    rig.report_results(second, *(result(each, "returned") for each in hidden))
-    assert [each.job.job_id for each in rig.poll(second, 2)] == [lease.job.job_id]
-
-
 def test_infrastructure_failures_back_off_and_are_counted() -> None:
     rig, (first, second), lease = one_job("w1", "w2")
     rig.report_results(first, result(lease, "failed", error="disk full"))

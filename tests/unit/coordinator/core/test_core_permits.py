@@ -3,6 +3,7 @@ alive."""
 
 from __future__ import annotations
 
+from collections import Counter
 from typing import Any
 
 import msgspec
@@ -107,19 +108,6 @@ def test_an_agent_gone_from_one_kernel_is_not_ended_elsewhere(rig: Rig) -> None:
     assert rig.row(PermitRow, "r1", HERE).ended_at is not None
 
 
-def test_an_agent_that_asks_again_stops_hidden_jobs(rig: Rig) -> None:
-    session = scored(rig)
-    rig.create("r1", agent=HERE)
-    gone(rig)
-    leases = rig.poll(session, 8)
-    hidden = [lease for lease in leases if split_of(lease.job) == "validation"]
-    assert hidden
-    assert not rig.permit("r1", HERE).granted
-    assert set(rig.beat(session, *leases).cancelled) == {lease.lease_id for lease in hidden}
-    rig.report_results(session, *(result(lease, "returned") for lease in hidden))
-    assert rig.permit("r1", HERE).granted
-
-
 def test_a_worker_on_an_unknown_kernel_plays_nothing_hidden(rig: Rig) -> None:
     session = scored(rig, boot_id="")
     assert splits(rig.poll(session, 8)) == {"random"}
@@ -128,44 +116,76 @@ def test_a_worker_on_an_unknown_kernel_plays_nothing_hidden(rig: Rig) -> None:
     assert registered.hidden_bar == rig.status().workers[0].hidden_bar
 
 
-def test_a_permit_stops_hidden_jobs_and_waits_for_their_worker(rig: Rig) -> None:
-    """Attack: starts while a hidden episode is being stopped, or while its worker is silent. Defence: the
-    permit is granted only after the worker has released the episode, or has certainly stopped it."""
+def test_a_permit_waits_until_hidden_jobs_have_ended(rig: Rig) -> None:
+    """Attack: starts while a hidden episode is played. Defence: the permit is granted only after the worker has
+    released the episode; none is leased there in the meantime."""
     session = scored(rig)
-    leases = rig.poll(session, 8)
-    hidden = [lease for lease in leases if split_of(lease.job) == "validation"]
+    leases = rig.poll(session, 1)
+    while splits(leases) != {"validation"}:
+        rig.play(session, *leases)
+        leases = rig.poll(session, 1)
     rig.create("r1", agent=None)
+    assert rig.permit("r1", HERE, wait_s=3.0) is None
+    request = rig._requests
+    assert rig.beat(session, *leases).cancelled == ()
+    assert "validation" not in splits(rig.poll(session, 8))
+    rig.pass_time(3.0)
+    assert (rig.replies[request].granted, "hidden" in rig.replies[request].waits_for) == (False, True)
     assert rig.permit("r1", HERE, wait_s=20.0) is None
     request = rig._requests
-    assert set(rig.beat(session, *leases).cancelled) == {lease.lease_id for lease in hidden}
-    assert request not in rig.replies
-    rig.report_results(session, *(result(lease, "returned") for lease in hidden))
+    rig.play(session, *leases)
     assert rig.replies[request] == gateway.Permit(granted=True)
-    jobs = [rig.core.state.jobs[lease.job.job_id] for lease in hidden]
-    assert [(job.preemptions, job.failures) for job in jobs] == [(0, 0)] * len(jobs)
     assert rig.core.state.runs["r0"].state.infrastructure_retries == 0
 
 
-def test_a_late_permit_names_its_wait_and_bars_hidden_jobs(rig: Rig) -> None:
-    session, leases = played(rig)
-    assert rig.permit("r1", HERE, wait_s=3.0) is None
-    request = rig._requests
-    rig.beat(session, *leases)
-    rig.pass_time(3.0)
-    rig.beat(session, *leases)
-    assert rig.replies[request].granted is False
-    assert "hidden" in rig.replies[request].waits_for
-    rig.report_results(session, *(result(lease, "returned") for lease in leases))
-    assert rig.permit("r1", HERE).granted
+def test_an_open_run_plays_nothing_hidden(rig: Rig) -> None:
+    """Attack: has its checkpoints validated while it can still submit. Defence: hidden episodes start when the run has
+    closed."""
+    session = rig.begin(0, worker={"slots": 8}, run={"agent": "remote"})
+    rig.play(session, *rig.poll(session))
+    assert rig.poll(session, 8) == []
+    rig.load()
+    session = rig.register(slots=8)
+    rig.pass_time(rig.settings.adoption_s)
+    assert rig.poll(session, 8) == []
+    rig.close()
+    assert splits(rig.poll(session, 8)) == {"validation", "random"}
+
+
+@pytest.mark.parametrize("restart", [False, True])
+def test_each_submit_is_validated_once_equal_bundles_too(rig: Rig, restart: bool) -> None:
+    session = rig.begin(0, worker={"slots": 8}, run={"agent": "remote", "n_valid": 2})
+    rig.play(session, *rig.poll(session))
+    rig.submit(1, key="k1")
+    rig.play(session, *rig.poll(session))
+    rig.close()
+    jobs: Counter[str] = Counter()
+    for _ in range(20):
+        leases = rig.poll(session, 1)
+        jobs.update(lease.job.job_id for lease in leases)
+        rig.play(session, *leases)
+        if restart:
+            rig.load()
+            session = rig.register(slots=8)
+            rig.pass_time(rig.settings.adoption_s)
+    validated = {job: n for job, n in jobs.items() if "/validation/" in job}
+    assert validated == {f"r1/s{index}/validation/{case}": 1 for index in (0, 1) for case in (0, 1)}
+    assert rig.finished().status == "completed"
 
 
 def test_a_request_that_is_never_sent_again_is_forgotten(rig: Rig) -> None:
-    session, leases = played(rig)
+    session = scored(rig)
+    leases: list[wire.Lease] = []
+    while splits(leases) != {"validation"}:
+        rig.play(session, *leases)
+        leases = rig.poll(session, 1)
+    rig.create("r1", agent=None)
     assert not rig.permit("r1", HERE).granted
-    rig.report_results(session, *(result(lease, "returned") for lease in leases[:0]))
-    rig.pass_time(11.0)
-    rig.beat(session)
-    assert splits(rig.poll(session, 8)) >= {"validation"}
+    assert "validation" not in splits(rig.poll(session, 8))
+    for _ in range(3):
+        rig.pass_time(4.0)
+        rig.beat(session, *leases)
+    assert "validation" in splits(rig.poll(session, 8))
     assert kernels.kernel(rig.core.state, HERE).asks == {}
 
 
@@ -195,9 +215,13 @@ def test_a_returning_worker_without_leases_frees_its_kernel(rig: Rig) -> None:
 
 def test_a_lease_in_transit_is_not_taken_for_a_released_one(rig: Rig) -> None:
     session = scored(rig)
+    for _ in range(2):  # no lease is given up just after a start
+        rig.pass_time(10.0)
+        rig.beat(session)
     rig.poll(session, 8, serial=7)
     rig.create("r1", agent=None)
     assert not rig.permit("r1", HERE).granted
+    rig.pass_time(7.0)
     for settled in (6, 7):
         rig.ask(wire.Heartbeat, worker="w1", session=session, held=(), settled=settled)
         assert rig.permit("r1", HERE).granted is (settled == 7)
@@ -210,8 +234,8 @@ def test_known_workers_count_as_playing_after_a_restart_until_heard(rig: Rig) ->
     assert rig.permit("r1", "another-machine").granted
     session = rig.register(slots=8, beats=False)
     rig.beat(session, *leases)
-    assert not rig.permit("r1", HERE).granted  # told to stop, but not yet known to have
-    rig.beat(session)
+    assert not rig.permit("r1", HERE).granted  # it plays them to their end
+    rig.play(session, *leases)
     assert rig.permit("r1", HERE).granted
 
 
@@ -229,7 +253,6 @@ def test_a_hidden_lease_is_not_adopted_where_an_agent_may_be_alive(rig: Rig) -> 
 def test_a_permit_ends_with_its_run(rig: Rig) -> None:
     session = rig.begin(0, worker={"slots": 8}, run={"agent": HERE})
     rig.play(session, *rig.poll(session))
-    assert rig.poll(session, 8) == []
     rig.close()
     assert rig.row(PermitRow, "r1", HERE).ended_at == rig.now
     assert splits(rig.poll(session, 8)) == {"validation", "random"}

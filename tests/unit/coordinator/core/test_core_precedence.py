@@ -31,6 +31,7 @@ def splits(leases: list[wire.Lease]) -> list[str]:
 def keep_alive(rig: Rig, session: str, seconds: float, *held: wire.Lease) -> None:
     for _ in range(int(seconds / 2.0)):
         rig.pass_time(2.0)
+        rig.poll(session, 0)
         rig.beat(session, *held)
 
 
@@ -71,24 +72,6 @@ def test_the_order_is_turned_back_when_nothing_hidden_is_left(rig: Rig) -> None:
     assert rig.replies[request].granted
 
 
-def test_before_that_new_agents_stop_hidden_cases(rig: Rig) -> None:
-    session = rig.register(slots=8)
-    closed(rig, session, "r0")
-    rig.play(session, *[lease for lease in rig.poll(session, 8) if split_of(lease.job) == "random"])
-    for number in range(1, 8):
-        run = f"r{number}"
-        rig.create(run, agent=None)
-        held = [lease for lease in rig.core.state.workers["w1"].leases.values() if lease.live]
-        assert held
-        assert not rig.permit(run, HERE).granted
-        for lease in held:
-            rig.report_results(session, wire.JobResult(lease_id=lease.id, job_id=lease.job.job_id, attempt=lease.attempt, kind="returned"))  # fmt: skip  # noqa: E501
-        assert rig.permit(run, HERE).granted
-        rig.close(run)
-        rig.poll(session, 8)
-    assert rig.core.state.runs["r0"].state.infrastructure_retries == 0
-
-
 def test_with_agents_elsewhere_train_and_hidden_jobs_take_turns() -> None:
     rig = Rig(hidden_wait_s=20.0)
     session = rig.begin(worker={"slots": 1}, run={"agent": "remote", "budget": 64, "train": 64, "most": 64})
@@ -114,7 +97,7 @@ def test_submits_that_wait_for_hidden_cases_say_so(rig: Rig) -> None:
     closed(rig, session, "r0")
     rig.create("r1", agent="remote")
     rig.play(session, *rig.poll(session, 1))
-    rig.core.state.lanes[next(iter(rig.core.state.lanes))].kept_s[rig.core.state.runs["r0"].case_set] = WAIT_S
+    rig.core.state.runs["r0"].flow.kept_s = WAIT_S
     # A train job that runs keeps the hidden ones away; meanwhile the order is turned over.
     rig.submit(0, 1, run="r1")
     (train,) = rig.poll(session, 1)
@@ -148,13 +131,12 @@ def test_the_time_a_submit_is_held_counts_against_no_limit(rig: Rig) -> None:
     rig.create("r1", agent="remote", limits=ResourceLimits(submit_wall_s=20.0))
     closed(rig, session, "r0")
     rig.play(session, *rig.poll(session, 1))
-    lane = next(iter(rig.core.state.lanes.values()))
     rig.submit(0, 1, run="r1")
     (train,) = rig.poll(session, 1)
     while split_of(train.job) != "train":
         rig.play(session, train)
         (train,) = rig.poll(session, 1)
-    lane.kept_s[rig.core.state.runs["r0"].case_set] = WAIT_S
+    rig.core.state.runs["r0"].flow.kept_s = WAIT_S
     keep_alive(rig, session, 4.0, train)
     rig.play(session, train)
     (hidden,) = rig.poll(session, 1)
@@ -218,37 +200,10 @@ def test_an_agent_that_delays_others_is_named_until_its_limit() -> None:
     assert "r1" not in rig.core.state.runs
 
 
-def test_an_idle_worker_does_not_prevent_a_reservation(rig: Rig) -> None:
-    """Attack: a worker claims a kernel that does not exist, so that none is reserved for hidden cases.
-    Defence: kernels on which no worker plays or asks for jobs do not count."""
-    session = rig.register(slots=8)
-    closed(rig, session, "r0")
-    rig.create("r1", agent=HERE)
-    rig.play(session, *rig.poll(session, 8))
-    idle = rig.register("w2", boot_id="made-up")
-    for _ in range(40):
-        rig.pass_time(2.0)
-        rig.beat(session)
-        rig.beat(idle)
-    turned = [name for name, kernel in rig.core.state.kernels.items() if kernel.reversals]
-    assert turned == [HERE]
-
-
-def test_early_validation_never_keeps_an_agent_away(rig: Rig) -> None:
-    session = rig.register(slots=8)
-    rig.create("r0", agent=HERE)
-    rig.submit(0, run="r0")
-    rig.play(session, *rig.poll(session))
-    keep_alive(rig, session, 3 * WAIT_S)
-    rig.create("r1", agent=None)
-    assert rig.permit("r1", HERE).granted
-    assert not kernels.kernel(rig.core.state, HERE).reversals
-
-
 @pytest.mark.parametrize("why", ["draining", "lost"])
 def test_a_kernel_whose_workers_are_gone_is_turned_back(rig: Rig, why: str) -> None:
     session = waiting(rig)
-    assert kernels.kernel(rig.core.state, HERE).reversals
+    assert kernels.kernel(rig.core.state, HERE).reservations
     if why == "draining":
         rig.ask(operator.SetWorker, worker="w1", state="draining")
         keep_alive(rig, session, 4.0)
@@ -268,8 +223,9 @@ def test_the_kernel_with_the_fewest_related_agents_is_reserved(rig: Rig) -> None
     for _ in range(40):
         rig.pass_time(2.0)
         for session in sessions:
+            rig.poll(session, 0)
             rig.beat(session)
-    turned = [name for name, kernel in rig.core.state.kernels.items() if kernel.reversals]
+    turned = [name for name, kernel in rig.core.state.kernels.items() if kernel.reservations]
     assert turned == ["kernel-of-w2"]
 
 
@@ -322,22 +278,26 @@ def test_related_train_and_hidden_jobs_never_share_a_kernel(rig: Rig) -> None:
     """Attack: has a hidden episode signal a train episode beside it, whose feedback reaches an agent
     anywhere. Defence: train and hidden jobs of related runs are never leased on one kernel."""
     first, second = rig.register("w1", slots=4, boot_id="one"), rig.register("w2", slots=4, boot_id="one")
-    closed(rig, first, "r0")
-    rig.play(first, *[lease for lease in rig.poll(first, 8) if split_of(lease.job) == "random"])
-    hidden = [lease for lease in rig.core.state.workers["w1"].leases.values() if lease.live]
-    assert hidden
+    rig.create("r0", n_valid=6)
+    rig.submit(0, run="r0")
+    rig.play(first, *rig.poll(first))
+    rig.close("r0")
+    hidden: list[wire.Lease] = []
+    while len(hidden) < 4:
+        leases = rig.poll(first, 1)
+        rig.play(first, *[lease for lease in leases if split_of(lease.job) == "random"])
+        hidden += [lease for lease in leases if split_of(lease.job) != "random"]
     rig.create("r1", agent="remote")
     rig.submit(0, 1, run="r1")
     assert "train" not in splits(rig.poll(second, 4))
-    reply = rig.beat(first)
-    assert reply is not None
-    assert not [lease for lease in hidden if lease.live], "they are stopped for it"
-    rig.beat(first)
+    rig.play(first, hidden[0])
+    assert splits(rig.poll(first, 4)) == [], "hidden jobs wait for related train jobs that wait"
+    rig.play(first, *hidden[1:])
     train = rig.poll(second, 4)
-    assert "train" in splits(train)
-    assert "validation" not in splits([*train, *rig.poll(first, 4)])
+    assert splits(train) == ["train"]
+    assert splits(rig.poll(first, 4)) == []
     rig.play(second, *train)
-    assert splits(rig.poll(first, 4)) == ["validation"]
+    assert "validation" in splits(rig.poll(first, 4))
 
 
 def test_a_rescore_waits_for_agents_of_related_runs(rig: Rig) -> None:
@@ -379,3 +339,91 @@ def test_a_rescore_waits_for_agents_of_related_runs(rig: Rig) -> None:
     rig.work_off(session)
     played = {row.group for row in rig.rows.values() if isinstance(row, OutcomeRow)}
     assert "evaluation/of-this-epoch" in played
+
+
+def reserved(rig: Rig) -> list[str]:
+    return [name for name, kernel in rig.core.state.kernels.items() if kernel.reservations]
+
+
+def test_a_worker_that_never_polls_neither_frees_hidden_cases_nor_bars_agents(rig: Rig) -> None:
+    """Attack: registers on a made-up kernel, so that hidden cases seem to have a place without agents."""
+    session = rig.register(slots=8)
+    closed(rig, session, "r0")
+    rig.create("r1", agent=HERE)
+    rig.play(session, *rig.poll(session, 8))
+    idle = rig.register("w2", boot_id="made-up")
+    for _ in range(40):
+        rig.pass_time(2.0)
+        rig.poll(session, 8)
+        rig.beat(session)
+        rig.beat(idle)
+    assert reserved(rig) == [HERE]
+    for _ in range(20):  # now the other one polls no more
+        rig.pass_time(2.0)
+        rig.beat(session)
+        rig.beat(idle)
+    assert reserved(rig) == []
+    rig.create("r2", agent=None)
+    assert rig.permit("r2", HERE).granted
+
+
+@pytest.mark.parametrize("away", ["class", "tier"])
+def test_hidden_cases_that_nobody_there_can_play_keep_no_agent_away(rig: Rig, away: str) -> None:
+    session = rig.register(slots=8)
+    closed(rig, session, "r0")
+    rig.create("r1", agent=HERE)
+    rig.play(session, *rig.poll(session, 8))
+    rig.ask(operator.SetWorker, worker="w1", state="paused")
+    more = {"version": "2"} if away == "class" else {"tiers": ("landlock",)}
+    other = rig.register("w2", boot_id=HERE, **more)
+    for _ in range(80):
+        rig.pass_time(2.0)
+        rig.poll(other)
+        rig.beat(session)
+        rig.beat(other)
+    assert reserved(rig) == []
+    rig.create("r2", agent=None)
+    assert rig.permit("r2", HERE).granted
+
+
+def test_endless_scoring_leaves_a_waiting_submit_its_turn(rig: Rig) -> None:
+    """Attack: closes one related run after another, so that hidden cases hold the submits of others for ever. Defence:
+    hidden cases that come later do not prolong a reservation."""
+    session = rig.register(slots=1)
+    rig.create("r1", agent="remote")
+    closed(rig, session, "c0")
+    rig.submit(0, 1, run="r1")
+    n = 0
+    for _ in range(400):
+        if sum(name.startswith("c") for name in rig.core.state.runs) < 3:
+            n += 1
+            rig.create(f"c{n}", agent="remote", train=4)
+            rig.submit(0, run=f"c{n}")
+        for lease in rig.poll(session, 1):
+            keep_alive(rig, session, 6.0, lease)
+            rig.play(session, lease)
+        for name, run in list(rig.core.state.runs.items()):
+            if name.startswith("c") and run.state.phase == "open" and run.open is None:
+                rig.close(name)
+        keep_alive(rig, session, 2.0)
+        if rig.core.state.runs["r1"].open is None:
+            break
+    assert rig.core.state.runs["r1"].submits[0].status == "ok"
+
+
+def test_hidden_cases_and_a_submit_that_wait_at_a_restart_both_end() -> None:
+    rig = Rig(hidden_wait_s=20.0)
+    session = rig.begin(worker={"slots": 1}, run={"agent": "remote", "budget": 64, "train": 64, "most": 64})
+    closed(rig, session, "r0")
+    rig.submit(*range(20), run="r1")
+    assert splits(rig.poll(session, 1)) == ["train"]
+    for _ in range(6):
+        rig.load()
+        session = rig.register(slots=1)
+        keep_alive(rig, session, 8.0)
+    for _ in range(200):
+        leases = rig.poll(session, 1)
+        keep_alive(rig, session, 2.0, *leases)
+        rig.play(session, *leases)
+    assert rig.finished("r0").status == "completed"
+    assert rig.core.state.runs["r1"].submits[0].status == "ok"

@@ -6,7 +6,7 @@ from typing import Any
 
 import msgspec
 import pytest
-from rigs.core_rig import BUNDLE, Rig, done, outcome_of, result
+from rigs.core_rig import BUNDLE, Rig, done, outcome_of, result, split_of
 from rigs.store_rows import blob
 
 from evopolicy_common.messages import gateway, operator
@@ -191,7 +191,8 @@ def test_scope_submit_plays_hidden_cases_in_equal_chunks() -> None:
     assert [spec.case.seed for spec in lease.job.episodes] == [4, 4, 9]
     assert len({spec.policy_seed for spec in lease.job.episodes}) == 3
     rig.report_results(session, done(lease))
-    hidden = rig.poll(session, 8)
+    rig.close()
+    hidden = [each for each in rig.poll(session, 8) if split_of(each.job) == "validation"]
     assert [[spec.episode_index for spec in each.job.episodes] for each in hidden] == [[0, 1, 2], [0, 1]]
     assert {each.job.record for each in hidden} == {"actions"}
     assert all(each.job.env_meta == lease.job.env_meta for each in hidden)

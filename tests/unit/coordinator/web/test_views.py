@@ -84,14 +84,14 @@ def test_a_finished_run_tells_how_many_jobs_were_played_again(tmp_path: Path) ->
 def test_the_cluster_page_has_the_queue_by_priority_and_the_disks(tmp_path: Path) -> None:
     waits, queued = {"a free slot": 1}, partial(QueuedJobs, env="gym/acrobot")
     train = queued(priority="train", runs=2, waiting=5, leased=1, waits_for=waits)
-    queue = (train, queued(priority="heldout", runs=1, waiting=9, leased=0))
+    queue = (train, queued(priority="hidden", runs=1, waiting=9, leased=0))
     disk = DiskUse(database=3 << 30, free=20 << 30, total=80 << 30)
     reply = status(open_status("r-1"), workers=(worker("w"),), queue=queue, disk=disk)
     with client(site_of(tmp_path, cluster=reply)) as browser:
         page = browser.get("/cluster").text
-    for text in ("1 for a free slot", "held-out, final validation", "3.0 GiB", "20.0 GiB", "75 % used"):
+    for text in ("1 for a free slot", "validation, held-out", "3.0 GiB", "20.0 GiB", "75 % used"):
         assert text in page, text
-    assert page.index(">train<") < page.index(">held-out, final validation<")
+    assert page.index(">train<") < page.index(">validation, held-out, hidden evaluation<")
     assert str(tmp_path.resolve()) in page, "the disk of the runs here"
 
 
