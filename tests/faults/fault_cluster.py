@@ -37,6 +37,7 @@ HIDDEN = 4
 TOTAL = SUBMITS * EPISODES + SUBMITS * HIDDEN + 2 * HIDDEN
 """Episodes of a whole run: train, validation of each checkpoint, held-out and the random reference."""
 TIMEOUT_S = 100.0
+PORT = 7447
 DISK_BYTES = 512 << 20
 """Of each file system: the coordinator's state is on one, the run directories on another."""
 KINDS = {
@@ -183,7 +184,8 @@ class FaultCluster:
         launcher = Path(__file__).with_name("fixed_coordinator.py")
         coordinator = [sys.executable, str(launcher), str(self.state), str(self._ready)]
         if self.cable is not None or site == "relay":
-            coordinator.append(f"tcp/{Cable.NEAR if self.cable is not None else '127.0.0.1'}:0")
+            # Of a network namespace of our own, so the port is free, and the same when it is started again.
+            coordinator.append(f"tcp/{Cable.NEAR if self.cable is not None else '127.0.0.1'}:{PORT}")
         self.coordinator = Kept(coordinator, root / "coordinator.log", self._environment)
         stack.callback(self.coordinator.end)
         deadline = time.monotonic() + TIMEOUT_S
