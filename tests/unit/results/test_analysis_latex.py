@@ -81,9 +81,8 @@ def test_a_table_too_wide_is_in_panels_that_each_name_their_rows() -> None:
 def test_long_texts_are_broken_into_lines_and_numbers_never() -> None:
     text = to_latex(table(2, 3, 2))
     spec = next(line for line in text.splitlines() if line.startswith("\\begin{tabular}"))
-    assert len(re.findall(r"p\{\d+pt\}", spec)) == 2
+    assert spec.count("p{12em}") == 2
     assert spec.endswith("rrr}")
-    assert sum(int(points) for points in re.findall(r"p\{(\d+)pt\}", spec)) < 375
 
 
 def test_a_long_name_may_be_broken_where_it_has_joints() -> None:
@@ -91,12 +90,11 @@ def test_a_long_name_may_be_broken_where_it_has_joints() -> None:
     assert "gymnasium/\\allowbreak{}MiniGrid-\\allowbreak{}ObstructedMaze-" in text
 
 
-def test_a_table_too_long_goes_on_over_pages_under_its_heading() -> None:
+def test_a_table_too_long_goes_on_in_further_floats_under_its_heading() -> None:
     text = to_latex(table(0, 3, 80))
-    assert "\\begin{longtable}{lrrr}" in text
-    assert "\\begin{table}" not in text
-    assert text.count("\\begin{longtable}") == text.count("\\caption") == text.count("\\label") == 1
-    assert text.splitlines()[0] == "% needs \\usepackage{array,booktabs,longtable}"
+    assert text.count("\\begin{table}") == text.count("\\toprule") == 2
+    assert text.count("\\label") == text.count("\\addtocounter{table}{-1}\\caption{(continued)}") == 1
+    assert text.count(" & 1.500") == 240
     assert text.count("Number") == 6
 
 
@@ -109,7 +107,7 @@ def test_what_is_written_compiles_and_fits_the_page(tmp_path: Path) -> None:
     for i, one in enumerate([TABLE, table(0, 24, 2), table(2, 3, 2), table(3, 30, 60, strange)]):
         (tmp_path / f"{i}.tex").write_text(to_latex(one))
         names.append(f"\\input{{{i}.tex}}")
-    page = "\\documentclass{article}\\textwidth=397pt\\usepackage{array,booktabs,longtable}"
+    page = "\\documentclass{article}\\textwidth=397pt\\usepackage{adjustbox,array,booktabs}"
     (tmp_path / "all.tex").write_text(page + "\\begin{document}" + "\n".join(names) + "\\end{document}\n")
     for _ in range(2):
         done = subprocess.run(
@@ -122,6 +120,4 @@ def test_what_is_written_compiles_and_fits_the_page(tmp_path: Path) -> None:
         )
         assert done.returncode == 0, done.stdout[-3000:]
     assert "Float too large" not in done.stdout
-    # The words of a heading are as wide as they are.
-    over = [float(points) for points in re.findall(r"Overfull \\hbox \(([\d.]+)pt", done.stdout)]
-    assert all(points < 10 for points in over), done.stdout
+    assert "Overfull" not in done.stdout
