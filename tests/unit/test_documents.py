@@ -134,18 +134,6 @@ def test_every_command_is_in_a_document_and_its_help_has_an_example() -> None:
     assert [name for name, each in commands() if "Example: " not in f"{each.epilog} {each.help}"] == []
 
 
-def test_the_places_of_rules_that_the_architecture_names_define_them() -> None:
-    text = text_of("ARCHITECTURE.md").partition("**Where to find a rule:**")[2].partition("\n## ")[0]
-    named = re.findall(r"`([\w/]+\.py)`(?:: | \()`(\w+)`", text)
-    assert len(named) > 20
-    for path, name in named:
-        (found,) = (each for each in tree() if each.endswith("/" + path) and not each.startswith("tests/"))
-        assert re.search(rf"^(def |async def |class )?{name}\b", (ROOT / found).read_text(), re.MULTILINE), (
-            path,
-            name,
-        )
-
-
 def test_the_keys_that_the_architecture_lists_are_those_that_are_answered() -> None:
     listed = re.findall(r"`(?:work|gw/<run>)/\{([^}]+)\}`", text_of("ARCHITECTURE.md"))
     assert len(listed) == 2
