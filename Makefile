@@ -88,12 +88,14 @@ test-system test-long: PROCESSES = $$(( $$(nproc) + 4 ))
 # These compute most of the time, and have limits on time; browsers and clusters wait.
 test-families: PROCESSES = $$(( $$(nproc) + 2 ))
 test test-root: HOST = --tests
+# What killed commands leave there goes with the folder of the tests.
+test test-root: TEMPORARY = TMPDIR="$$short"
 test-system test-families test-long: HOST = --all-tests
 # The tests start hundreds of processes: none of them shall compile our modules anew, whatever the shell asks of Python.
 test test-root test-system test-families test-long: export PYTHONDONTWRITEBYTECODE :=
 test test-root test-system test-families test-long: install
 	@bash deploy/setup-host.sh $(HOST)
-	@short="$$(mktemp -d /tmp/evp-XXXXXX)"; chmod 711 "$$short"; TMPDIR="$$short" $(BIN)/python -m pytest --processes $(PROCESSES) --basetemp="$$short/t" \
+	@short="$$(mktemp -d /tmp/evp-XXXXXX)"; chmod 711 "$$short"; $(TEMPORARY) $(BIN)/python -m pytest --processes $(PROCESSES) --basetemp="$$short/t" \
 	$(if $(findstring tests/,$(ARGS)),,-m "$(LAYERS)") $(ARGS); status=$$?; \
 	if [ $$status = 0 ]; then rm -rf "$$short"; else echo "the failed tests' files are in $$short"; fi; exit $$status
 
