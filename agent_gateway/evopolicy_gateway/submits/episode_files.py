@@ -24,7 +24,13 @@ from evopolicy_common.messages.episode import PolicyFailure, ResourceLimits
 from evopolicy_common.messages.gateway import EpisodeFeedback, FeedbackDetail
 from evopolicy_common.records.episodes import rendered, trajectory
 from evopolicy_common.records.episodes.npz import read_arrays
-from evopolicy_common.records.episodes.rendered import MAX_OBSERVATIONS_BYTES, OBSERVATIONS, ROWS, SINGLE
+from evopolicy_common.records.episodes.rendered import (
+    LEFT_OUT,
+    MAX_OBSERVATIONS_BYTES,
+    OBSERVATIONS,
+    ROWS,
+    SINGLE,
+)
 from evopolicy_gateway.submits.formatting import cut_text, failure_line
 
 _NO_MESSAGE = "messages of a policy are left out at this run's level of feedback"
@@ -65,9 +71,8 @@ def within_share(files: dict[str, bytes], share: int) -> dict[str, bytes]:
             left_out.append(f"{name}: {len(kept[name]):,} bytes\n")
             size -= len(kept.pop(name))
     if left_out:
-        kept["left_out.txt"] = (
-            f"Left out, as an episode's files may take {share:,} bytes in this run:\n{''.join(left_out)}".encode()
-        )
+        text = f"Left out, as an episode's files may take {share:,} bytes in this run:\n{''.join(left_out)}"
+        kept[LEFT_OUT] = kept.get(LEFT_OUT, b"") + text.encode()
     return kept
 
 

@@ -24,6 +24,7 @@ from typing import Any
 import msgspec
 
 from evopolicy_common.catalogue import worlds
+from evopolicy_common.catalogue.definition import MAX_STEPS as MAX_STEPS
 from evopolicy_common.catalogue.definition import USUAL_STEPS as USUAL_STEPS
 from evopolicy_common.catalogue.definition import Entry as Entry
 from evopolicy_common.catalogue.definition import Wrapper as Wrapper

@@ -71,6 +71,8 @@ class Entry(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     """Module of the worker's environments that plays it."""
     kwargs: dict[str, Any] = {}
     """Keyword arguments of `gymnasium.make`."""
+    reset_options: dict[str, Any] = {}
+    """The `options` of every `reset`; those of a case come on top."""
     wrappers: tuple[Wrapper, ...] = ()
     """Wrappers around the environment, the innermost first."""
     task: str = ""
@@ -206,7 +208,8 @@ def _data(where: str, path: Path, names: tuple[str, ...]) -> tuple[str, ...]:
     for name in names:
         place = folder / name
         real = place.resolve() if "\0" not in name else folder
-        hidden = any(part.startswith(".") for part in Path(name).parts)
+        parts = (*Path(name).parts, *real.parts[len(folder.parts) :])
+        hidden = any(part.startswith(".") for part in parts)
         if real == folder or not real.is_relative_to(folder) or hidden:
             raise ConfigError(
                 f"{where}: data {name[:80]!r}: name files and folders in the environment file's folder, relative to it"
@@ -246,8 +249,9 @@ def _fault(entry: Entry) -> str:
         return f"reward_weights {entry.reward_weights}: weights have to be finite numbers"
     if len(entry.title) > _MAX_ID or not entry.title.isprintable():
         return f"title {entry.title[:80]!r}: one line of {_MAX_ID} characters at most"
-    if not _is_plain(entry.kwargs):
-        return "kwargs: finite numbers, texts, lists and tables only, no dates"
+    for name in ("kwargs", "reset_options"):
+        if not _is_plain(getattr(entry, name)):
+            return f"{name}: finite numbers, texts, lists and tables only, no dates"
     if not all(_is_plain(each.kwargs) for each in entry.wrappers):
         return "wrappers.kwargs: finite numbers, texts, lists and tables only"
     return ""

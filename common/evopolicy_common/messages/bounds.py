@@ -24,6 +24,8 @@ Word = Annotated[str, Meta(max_length=1024)]
 """A name, an id, a token, a digest."""
 Text = Annotated[str, Meta(max_length=1 << 18)]
 Bytes = Annotated[bytes, Meta(max_length=16 << 20)]
+Blob = Annotated[bytes, Meta(max_length=1 << 30)]
+"""Bytes that a slot's pipe carries whole. In a message to or from the coordinator, its own limit is the lower one."""
 Int = Annotated[int, Meta(ge=-(2**63), le=2**63 - 1)]
 Number = Annotated[float, Meta(ge=-sys.float_info.max, le=sys.float_info.max)]
 """A finite float."""

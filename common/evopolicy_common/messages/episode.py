@@ -6,7 +6,7 @@ from typing import Literal
 
 import msgspec
 
-from evopolicy_common.messages.bounds import Bytes, Int, Many, Named, Number, Plain, Text, Word
+from evopolicy_common.messages.bounds import Blob, Bytes, Int, Many, Named, Number, Plain, Text, Word
 from evopolicy_common.messages.environment import Case, FailedEpisodes, ObservationForm, PolicyScope
 
 FailureCategory = Literal[
@@ -92,7 +92,7 @@ class BlobRef(msgspec.Struct, frozen=True, kw_only=True):
     digest: Word
     """SHA-256 of the bytes, lowercase hex."""
     size: Int
-    inline: Bytes | None = None
+    inline: Blob | None = None
     """The bytes themselves; None when they must be fetched by digest."""
 
 

@@ -89,6 +89,8 @@ def verify(
             knows_run = await verifier.check_cases()
             lists = [*finished.train, *(finished.hidden if knows_run else ())]
             sizes = [len(played.env_instances) for played in lists]
+            if verifier.skips(sum(sizes)):
+                return verifier.report
             chosen = [(lists[k], indexes) for k, indexes in draw(sizes, sample or sum(sizes), seed)]
             if not chosen:
                 raise ConfigError(f"{run} has no episode to play again, as no submit was ok")

@@ -163,7 +163,12 @@ def _environments(runs: Iterable[Run]) -> Table:
 
     known = catalogue.entries()
     version = common("version", "Version", "text", lambda run: run.record.versions.env)
+
+    def repeats(run: Run) -> str:
+        return _YES_NO[run.record.versions.env_deterministic]
+
     note = "How long one policy object lives."
+    repeated = "Whether seed and actions determine an episode; where not, `verify` plays none again."
     table = tabulated(
         "environments",
         "Environments",
@@ -180,6 +185,7 @@ def _environments(runs: Iterable[Run]) -> Table:
             common("validation", "Validation cases", "integer", dimension("n_validation")),
             common("heldout", "Held-out cases", "integer", dimension("n_heldout")),
             common("scope", "Policy scope", "text", dimension("policy_scope"), note),
+            common("repeats", "Episodes repeat", "text", repeats, repeated),
         ),
         ordered_environments(by_env),
         "What was played: cases of a run's hidden splits, and the train episodes that it could spend.",

@@ -140,11 +140,19 @@ class Verifier:
                 f" --name {name} for a copy of the run directory without this file, and compare"
             )
             self.report.leaves_open(f"{FOLDER}/{name}.json", text)
-        if not versions.env_deterministic:
-            self.report.notes.append(
-                "this environment is marked as not deterministic: differences are to be expected"
-            )
         return state.knows_run
+
+    def skips(self, n: int) -> bool:
+        """Whether the run's `n` episodes are not played again, as its environment does not repeat them."""
+        if self._run.record.versions.env_deterministic:
+            return False
+        text = (
+            f"{n} not played again: the environment is marked as not deterministic, so the same actions give other"
+            " episodes"
+        )
+        self.report.leaves_open("episodes", text)
+        self.report.unchecked_episodes += n
+        return True
 
     async def replay(self, played: EpisodeList, indexes: Sequence[int]) -> None:
         """Makes the exact check of these episodes of a list."""

@@ -4,6 +4,9 @@ text.
 Attacks, each with its defence:
 - lies in a folder with runs, keys, `.env`, state (`PYTHONPATH=$PWD`), and reads them: only modules, packages
   and declared data of such folders are shown, without dot files, keys, run directories, state folders.
+- comes as a package with links to files of the operator's (another run's returns, the secret of all hidden cases, cloud
+  keys), and puts them into observations, which the agent reads: a link shows only a file of the link's own package that
+  is shown by itself, and no folder.
 """
 
 from __future__ import annotations
@@ -88,6 +91,46 @@ def test_an_environment_reads_its_modules_and_nothing_else_beside_them(
 def test_without_a_jail_the_same_environment_reads_it_all(slots: Slots, project: Path) -> None:
     _, info = played(slots, "none", entries(project, kwargs={"asks": SECRETS}))
     assert {name for name in SECRETS if info[name]} == set(SECRETS)
+
+
+LINKS = {
+    "parts/b.dat": "../../operator/run.json",
+    "parts/s.dat": "../../operator/secret",
+    "parts/r.dat": "../runs/e/toy_line/a/logs/env.log",
+    "parts/e.dat": ".env",
+    "parts/k.dat": "own.key",
+    "parts/l.dat": "runs/e/toy_line/a/logs/env.log",
+    "parts/i.dat": "state/identity.json",
+    "parts/chain.dat": "b.dat",
+    "parts/maps/up.dat": "../../token.txt",
+    "parts/folder": "../../operator",
+    "parts/near": "maps",
+    "whole/b.dat": "../../operator/secret",
+    "whole/folder": "../../operator",
+    "x.libs": "../operator",
+    "stolen.py": "../operator/secret",
+    "stolen": "../operator",
+    "plan.dat": "../operator/secret",
+}
+"""By name, the target of a link in the folder."""
+THROUGH = ("parts/folder/secret", "whole/folder/secret", "x.libs/secret", "stolen/secret", "parts/near/1.txt")
+
+
+@both_tiers
+def test_links_of_a_package_show_no_file_of_the_operators(tier: Tier, slots: Slots, project: Path) -> None:
+    operator = project.parent / "operator"
+    operator.mkdir(mode=0o700)
+    for name in ("run.json", "secret", "__init__.py"):
+        (operator / name).write_text("a secret")
+    (project / "whole").mkdir()
+    (project / "whole" / "__init__.py").touch()
+    for name, target in {**LINKS, "parts/alias.json": "table.json", "parts/maps/2.txt": "1.txt"}.items():
+        (project / name).symlink_to(target)
+    asks = [*LINKS, *THROUGH, "parts/alias.json", "parts/maps/2.txt"]
+    _, info = played(slots, tier, entries(project, kwargs={"asks": asks}))
+    assert {name for name in asks if info[name]} == {"parts/alias.json", "parts/maps/2.txt"}
+    _, info = played(slots, "none", entries(project, kwargs={"asks": asks}))
+    assert {name for name in asks if info[name]} >= {"parts/b.dat", "stolen.py", "x.libs/secret"}
 
 
 @both_tiers

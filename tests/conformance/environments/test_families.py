@@ -195,7 +195,7 @@ def test_check_env_names_what_is_not_kept_and_goes_on(
     assert "another episode" in verdicts["unseeded-v0"]
     assert "status" in verdicts["dies-v0"]
     assert "names the seed" in verdicts["tells-v0"]
-    assert verdicts["hash-v0"] == "another process plays another episode"
+    assert verdicts["hash-v0"].startswith("another process plays another episode; draw from self.np_random")
     assert verdicts["nothing-v0"] == "ok"
     # What is in the file is not played again.
     n = len(results.read_bytes().splitlines())

@@ -35,6 +35,8 @@ from evopolicy_worker.sandbox.zygote import Zygote
 from evopolicy_worker.slot_protocol import slot_messages as messages
 
 _PROGRESS_S = 0.25
+MOST_JOINED_BYTES = 1 << 20
+"""Larger frames are sent by themselves: joined with the next one, they would take their memory again."""
 ALIVE_S = 5.0
 """Interval of the messages that this process is alive, seconds, also during a long step."""
 
@@ -120,6 +122,9 @@ class EnvProcess:
             options = (progress, self._channel.send_frame, command.first, command.failure)
             last = player.play(command.job, self._bundle, *options)
             progress.give_up(None)
+            if len(last) > MOST_JOINED_BYTES:
+                self._channel.send_frame(last)
+                last = b""
             return last + messages.framed(messages.Played())
         except BaseException as error:  # such as an environment's sys.exit
             progress.give_up(self._channel.send)

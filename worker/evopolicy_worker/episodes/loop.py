@@ -16,7 +16,8 @@ Rules:
 - A policy's failure is a result, and so is the effect of its actions on the environment: if an environment breaks down
   on them, the episode is repeated once with random actions only. Other failures of environment or sandbox are raised.
 - A policy that was ended from outside is restarted together with its episode, and so is a hidden episode whose job was
-  returned. The actions that it returned remain valid, and so does its failure: no policy gets a second attempt.
+  returned. The actions that it returned remain valid, and so does its failure: no policy gets a second attempt. An
+  environment that is not deterministic would answer them with another episode, so there the episode starts over.
 """
 
 from __future__ import annotations
@@ -63,6 +64,7 @@ from evopolicy_worker import environments
 from evopolicy_worker.environments import Environment
 from evopolicy_worker.environments.interface.actions import ActionCodec, compile_actions
 from evopolicy_worker.environments.interface.base import Observation, Step
+from evopolicy_worker.environments.interface.calls import current as call
 from evopolicy_worker.environments.interface.calls import described, note
 from evopolicy_worker.environments.interface.trial import solved
 from evopolicy_worker.episodes.monitor import Monitor
@@ -125,7 +127,8 @@ class Player:
         if job.bundle is not None and files is None:
             raise WorkerError("a job with a bundle came without the bundle")
         self.policies.begin_job(job, files, environment, progress)
-        before = unpack(job)
+        repeats = environment.description.deterministic
+        before = unpack(job) if repeats else {}
         frame = b""
         films: list[tuple[int, bytes, int]] = []
         """Videos to make: the episode's index in the job, its actions and length."""
@@ -195,6 +198,8 @@ class Player:
                     raise
                 note(f"a policy is started again: {fault_of(error)}")
                 self.policies.drop()
+                if not environment.description.deterministic:
+                    begun.taken.clear()
             except (CancelledJobError, SandboxError, SlotDiedError, OSError, MemoryError):
                 raise
             except BaseException as error:  # such as an environment's sys.exit
@@ -459,7 +464,11 @@ def _brief(outcome: EpisodeOutcome, share: int) -> EpisodeOutcome:
 
 def _blob(data: bytes) -> BlobRef:
     if len(data) > codec.MAX_BLOB_BYTES:
-        raise WorkerError(f"a recording of {len(data):,} bytes; {codec.MAX_BLOB_BYTES:,} are the limit")
+        # Its actions take that many: no other attempt would take fewer.
+        raise BrokenEnvironmentError(
+            f"{call}: its recording has {len(data):,} bytes, and {codec.MAX_BLOB_BYTES:,} are the limit; give it a"
+            " lower max_episode_steps, or smaller actions or observations"
+        )
     return BlobRef(digest=digest_of(data), size=len(data), inline=data)
 
 

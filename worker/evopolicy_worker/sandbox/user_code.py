@@ -2,7 +2,13 @@
 
 A folder on the module search path may hold anything besides: run directories with hidden returns, state folders, keys.
 Shown are its modules, packages, and metadata of installed packages, without names that begin with a dot, key files, run
-directories and state folders, also inside packages and declared folders. Links to folders are not followed.
+directories and state folders, also inside packages and declared folders.
+
+A link is shown if it leads to a file of its own package (or of the folder, for a module that is a file) to which these
+rules apply in the same way; a link to a folder is never followed. In a folder that is shown as a whole, links stay
+links, whose targets do not exist in the jail unless they are shown, too. A hard link is a file like any other: git and
+archives make none to files outside, and Linux none to files that their maker may not write (fs.protected_hardlinks). A
+bind mount, which only root can make, is shown as the folder that it is.
 """
 
 from __future__ import annotations
@@ -29,21 +35,26 @@ def modules(folder: str) -> list[str]:
     """Paths of what is shown of a folder on the module search path, which need not exist."""
     shown: list[str] = []
     for entry in _entries(folder):
-        if entry.is_file() and entry.name.endswith(_MODULES):
+        if entry.name.endswith(_MODULES) and _is_file(entry, folder):
             shown.append(entry.path)
-        elif entry.is_dir() and (
+        elif entry.is_dir(follow_symlinks=False) and (
             entry.name.endswith(_INSTALLED) or any(os.path.exists(f"{entry.path}/{name}") for name in _INIT)
         ):
             shown += content(entry.path)
     return shown
 
 
-def content(path: str) -> list[str]:
+def content(path: str, package: str = "") -> list[str]:
     """The paths that are shown of a file or folder: the folder itself if nothing in it is hidden. Raises
-    SandboxError where that are too many files."""
+    SandboxError where that are too many files.
+
+    `package`: the folder to which a file belongs; by default the one in which it is.
+    """
     if not os.path.isdir(path):
-        return [path]
-    shown, whole = _content(path)
+        return [path] if _is_shown(path, package or os.path.dirname(path)) else []
+    if os.path.islink(path):
+        return []
+    shown, whole = _content(path, path)
     if len(shown) > _MOST and not whole:
         raise SandboxError(
             f"{path} has {len(shown):,} files and folders to show one by one, and {_MOST:,} are the limit: move hidden"
@@ -61,7 +72,11 @@ def declared(definitions: Iterable[Entry], folders: Sequence[str]) -> list[str]:
     for entry in definitions:
         names = (entry.gymnasium_id or "", *(wrapper.wrapper for wrapper in entry.wrappers))
         places = [_place(name.partition(":")[0].partition(".")[0], folders) for name in names if ":" in name]
-        for path in (*entry.data, *map(os.path.realpath, entry.data), *filter(None, places)):
+        for path in entry.data:
+            real = os.path.realpath(path)
+            package = os.path.commonpath([os.path.dirname(real), os.path.realpath(os.path.dirname(path))])
+            shown |= dict.fromkeys([*content(path, package), *content(real, package)])
+        for path in filter(None, places):
             shown |= dict.fromkeys(content(path))
     return list(shown)
 
@@ -91,33 +106,56 @@ def _place(top: str, folders: Sequence[str]) -> str:
     return place if os.path.isabs(place) else ""
 
 
+def _hidden(name: str) -> bool:
+    return name.startswith(".") or name.endswith(_KEYS)
+
+
+def _is_private(folder: str) -> bool:
+    """Whether it is a run directory, a folder of suites, or a state folder."""
+    return any(os.path.lexists(f"{folder}/{name}") for name in _OURS)
+
+
+def _is_shown(path: str, package: str) -> bool:
+    """Whether the path leads to a file in the folder `package` of which no part is hidden."""
+    real, folder = os.path.realpath(path), os.path.realpath(package)
+    if not real.startswith(f"{folder}/") or not os.path.isfile(real):
+        return False
+    for part in os.path.relpath(real, folder).split("/"):
+        if _hidden(part) or _is_private(folder):
+            return False
+        folder = f"{folder}/{part}"
+    return True
+
+
+def _is_file(entry: os.DirEntry[str], package: str) -> bool:
+    """Whether an entry that is not hidden is a file, or a link that is shown as one."""
+    return entry.is_file(follow_symlinks=False) or (entry.is_symlink() and _is_shown(entry.path, package))
+
+
 def _entries(folder: str) -> list[os.DirEntry[str]]:
-    """The entries of a folder that may be shown; none of a run directory or state folder, or of one that cannot be
-    read."""
+    """The entries of a folder that may be shown; none of one that cannot be read."""
     try:
         with os.scandir(folder) as listed:
             entries = sorted(listed, key=lambda entry: entry.name)
     except OSError:
         return []
-    return [entry for entry in entries if not entry.name.startswith(".") and not entry.name.endswith(_KEYS)]
+    return [entry for entry in entries if not _hidden(entry.name)]
 
 
-def _content(folder: str) -> tuple[list[str], bool]:
-    """The paths that are shown of a folder, and whether they are all of it."""
-    if any(os.path.lexists(f"{folder}/{name}") for name in _OURS):
+def _content(folder: str, package: str) -> tuple[list[str], bool]:
+    """The paths that are shown of a folder in a package, and whether they are all of it."""
+    if _is_private(folder):
         return [], False
     shown: list[str] = []
     entries = _entries(folder)
     whole = len(entries) == len(os.listdir(folder))
     for entry in entries:
         if entry.is_dir(follow_symlinks=False):
-            inner, entirely = _content(entry.path)
+            inner, entirely = _content(entry.path, package)
             shown += [entry.path] if entirely else inner
             whole = whole and entirely
-        elif entry.is_file():
+        elif _is_file(entry, package):
             shown.append(entry.path)
-            # A link is shown with its target, which a folder as a whole would not have.
-            whole = whole and not entry.is_symlink()
-        else:
+        elif not entry.is_symlink():
             whole = False
     return shown, whole

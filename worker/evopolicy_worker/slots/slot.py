@@ -62,6 +62,7 @@ DESCRIBED_CALLS = 3
 """A description may take as long as this number of calls."""
 _CHECK_S = 5.0
 MAX_ANSWER_BYTES = 1 << 31
+_PIECE = 1 << 20
 
 
 class Slot:
@@ -276,7 +277,7 @@ class Slot:
                     reply = await self._reply()
             except TimeoutError:
                 _kill(self._process)
-                why = hung(f"environment {env_id}, make, reset or step", limits)
+                why = hung(f"environment {env_id}, make, reset or step", limits.call_s)
                 raise BrokenEnvironmentError(why) from None
             except SlotDiedError as error:
                 why = f"environment {env_id}: its process ended while it was tried out; {error}"
@@ -346,7 +347,10 @@ class Slot:
             (length,) = messages.LENGTH.unpack(await process.stdout.readexactly(messages.LENGTH.size))
             if length > MAX_ANSWER_BYTES:
                 raise SlotDiedError(f"the slot's process announced an answer of {length} bytes")
-            data = await process.stdout.readexactly(length)
+            data = bytearray()
+            # Recordings have up to a gigabyte: in pieces, as the reader's own buffer would hold each twice.
+            while left := length - len(data):
+                data += await process.stdout.readexactly(min(left, _PIECE))
             self._n_replies += 1
             return messages.replies.decode(data)
         except DECODE_ERRORS as error:
@@ -368,7 +372,7 @@ class Slot:
             silent_s = silent_s + _CHECK_S if n_replies == self._n_replies and not stood_s else 0.0
             n_replies = self._n_replies
             if silent_s >= longest_s:
-                self._hung = hung(f"environment {env_id}, reset or step", self._start.limits)
+                self._hung = hung(f"environment {env_id}, reset or step", self._start.limits.call_s)
                 _kill(process)
                 silent_s = 0.0
             if stood_s >= STOPPED_S:

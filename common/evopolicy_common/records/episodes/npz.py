@@ -37,36 +37,48 @@ _VERSION, _UTF8, _DEFLATED, _DAY = 20, 0x800, 8, 0x21
 class NpzWriter:
     """Writes one file. Not thread-safe."""
 
-    def __init__(self) -> None:
+    def __init__(self, most: int = MAX_BYTES) -> None:
+        """`most`: limit of the file, bytes."""
         self._members: dict[str, _Member] = {}
         self._texts: dict[str, list[Any]] = {}
+        self._most = most
+        self._n_packed = 0
 
     def add(self, name: str, rows: NDArray[Any] | list[Any]) -> None:
-        """Adds rows of an array (n × its shape) or texts. Raises ProtocolError when they do not match earlier rows."""
+        """Adds rows of an array (n × its shape) or texts. Raises ProtocolError when they do not match earlier rows, or
+        when the file becomes too large."""
         if isinstance(rows, list):
             self._texts.setdefault(name, []).extend(rows)
             return
         if name not in self._members:
             self._members[name] = _Member(rows.dtype, rows.shape[1:])
-        self._members[name].add(rows)
+        self._n_packed += self._members[name].add(rows)
+        self._check(self._n_packed)
 
-    def finish(self) -> bytes:
-        """The file's bytes. The writer must not be used afterwards."""
+    def finish(self) -> list[bytes]:
+        """The file's bytes, in pieces. The writer must not be used afterwards."""
         for name, texts in self._texts.items():
             kind = np.str_ if all(isinstance(text, str) for text in texts) else None
             self.add(name, np.array(texts, dtype=kind))
-        body, directory = bytearray(), bytearray()
+        body, directory, at = list[bytes](), bytearray(), 0
         for name, member in self._members.items():
             encoded = f"{name}.npy".encode("utf-8", "backslashreplace")
             crc, size, packed = member.finish()
-            place = (_UTF8, _DEFLATED, 0, _DAY, crc, len(packed), size, len(encoded), 0)
-            directory += _CENTRAL.pack(b"PK\1\2", _VERSION, _VERSION, *place, 0, 0, 0, 0, len(body)) + encoded
-            body += _LOCAL.pack(b"PK\3\4", _VERSION, *place) + encoded + packed
+            n_packed = sum(map(len, packed))
+            place = (_UTF8, _DEFLATED, 0, _DAY, crc, n_packed, size, len(encoded), 0)
+            directory += _CENTRAL.pack(b"PK\1\2", _VERSION, _VERSION, *place, 0, 0, 0, 0, at) + encoded
+            body += [_LOCAL.pack(b"PK\3\4", _VERSION, *place) + encoded, *packed]
+            at += len(body[-len(packed) - 1]) + n_packed
         n = len(self._members)
-        end = _END.pack(b"PK\5\6", 0, 0, n, n, len(directory), len(body), 0)
-        if len(body) + len(directory) > MAX_BYTES:
-            raise ProtocolError(f"observations of {len(body):,} bytes; {MAX_BYTES:,} are the limit")
-        return bytes(body + directory) + end
+        end = _END.pack(b"PK\5\6", 0, 0, n, n, len(directory), at, 0)
+        self._check(at + len(directory) + len(end))
+        return [*body, bytes(directory), end]
+
+    def _check(self, size: int) -> None:
+        if size > self._most:
+            raise ProtocolError(
+                f"observations of more than {self._most:,} bytes, compressed, which are the limit"
+            )
 
 
 class _Member:
@@ -82,7 +94,8 @@ class _Member:
         self._stream = zlib.compressobj(LEVEL, zlib.DEFLATED, -15)
         self._pieces: list[bytes] = []
 
-    def add(self, rows: NDArray[Any]) -> None:
+    def add(self, rows: NDArray[Any]) -> int:
+        """Adds rows; the number of compressed bytes that they bring."""
         if rows.dtype != self._dtype or rows.shape[1:] != self._shape:
             raise ProtocolError(
                 f"observations of {rows.dtype} {rows.shape[1:]} follow those of {self._dtype} {self._shape}"
@@ -94,9 +107,10 @@ class _Member:
             raise ProtocolError(f"observations of {self._n_bytes:,} bytes; {MAX_BYTES:,} are the limit")
         self._crc = zlib.crc32(data, self._crc)
         self._pieces.append(self._stream.compress(data))
+        return len(self._pieces[-1])
 
-    def finish(self) -> tuple[int, int, bytes]:
-        """CRC-32 and size (bytes) of the `.npy` file, and its deflated bytes."""
+    def finish(self) -> tuple[int, int, list[bytes]]:
+        """CRC-32 and size (bytes) of the `.npy` file, and its deflated bytes in pieces."""
         out = io.BytesIO()
         fields = {
             "descr": np.lib.format.dtype_to_descr(self._dtype),
@@ -107,9 +121,11 @@ class _Member:
         header = out.getvalue()
         first = zlib.compressobj(LEVEL, zlib.DEFLATED, -15)
         # Flushed to a whole byte but not ended: the next block follows in the same stream.
-        packed = b"".join(
-            [first.compress(header), first.flush(zlib.Z_FULL_FLUSH), *self._pieces, self._stream.flush()]
-        )
+        packed = [
+            first.compress(header) + first.flush(zlib.Z_FULL_FLUSH),
+            *self._pieces,
+            self._stream.flush(),
+        ]
         crc = crc_of_both(zlib.crc32(header), self._crc, self._n_bytes)
         return crc, len(header) + self._n_bytes, packed
 

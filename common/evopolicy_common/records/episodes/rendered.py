@@ -37,12 +37,15 @@ from evopolicy_common.records.json_text import as_lists, rows_text
 MAGIC = b"evofeed1"
 ROWS: Final = "trajectory.jsonl"
 OBSERVATIONS: Final = "observations.npz"
+LEFT_OUT: Final = "left_out.txt"
 SINGLE = "observations"
 """Array name for observations that are one array per step."""
 MAX_ROWS_BYTES = 256 << 20
 """Limit of `trajectory.jsonl`, bytes. Actions alone cannot reach it: see `ResourceLimits.episode_action_bytes`."""
 MAX_OBSERVATIONS_BYTES = 1 << 30
-"""Limit of `observations.npz`, bytes."""
+"""Limit of a file of observations that is read, bytes; the published profiles have them uncompressed."""
+MAX_RECORDED_BYTES = 256 << 20
+"""Limit of the `observations.npz` of an episode, bytes; one that needs more has its rows alone."""
 MIN_PICTURE_SIDE = 16
 """Least height and width of a picture; smaller arrays of bytes count as symbols."""
 
@@ -82,7 +85,7 @@ class Header(msgspec.Struct, frozen=True, kw_only=True):
     """Number of steps."""
     files: tuple[File, ...]
     left_out: str = ""
-    """Why there are no files; empty when there are."""
+    """Why there are no files, or only the rows; empty when nothing is missing."""
 
 
 _headers = msgspec.msgpack.Decoder(Header)
@@ -99,43 +102,45 @@ class Renderer(Recorder):
         self._form: ObservationForm = observations
         # Observations are kept for a block, until they are rendered.
         self._full = True
-        self._npz = None if storage == "inline" else NpzWriter()
+        self._npz = None if storage == "inline" else NpzWriter(MAX_RECORDED_BYTES)
         self._held: deque[tuple[str, Any]] = deque()
         self._held_bytes = 0
         self._compressor = zstandard.ZstdCompressor(level=1).compressobj()
         self._rows: list[bytes] = []
         self._rows_size = 0
-        self._left_out = ""
+        self._left_out = self._unstored = ""
+        """Why there are no rows, and so no files; why there are no observations."""
 
     def finish(self) -> bytes:
         """The container's bytes. The recorder must not be used afterwards."""
         log = super().finish()
         self._compress_held(0)
-        files: list[tuple[File, bytes]] = []
-        if not self._left_out:
-            try:
-                files = list(self._files())
-            except ProtocolError as error:
-                self._left_out = str(error)
+        files = [] if self._left_out else list(self._files())
         header = Header(
             observations=self._form,
             n=self._n_packed,
             files=tuple(file for file, _ in files),
-            left_out=self._left_out[:1000],
+            left_out=(self._left_out or self._unstored)[:1000],
         )
-        parts = [columns.encoder.encode(header), log, *(data for _, data in files)]
-        return b"".join([MAGIC, *(piece for part in parts for piece in (_LENGTH.pack(len(part)), part))])
+        parts = [[columns.encoder.encode(header)], [log], *(pieces for _, pieces in files)]
+        return b"".join(
+            [MAGIC, *(piece for part in parts for piece in (_LENGTH.pack(sum(map(len, part))), *part))]
+        )
 
-    def _files(self) -> Iterator[tuple[File, bytes]]:
-        rows = b"".join([*self._rows, self._compressor.flush()])
-        yield File(name=ROWS, size=self._rows_size, packed="zstd"), rows
-        if self._npz is not None and self._n_packed:
-            data = self._npz.finish()
-            if len(data) > MAX_OBSERVATIONS_BYTES:
-                raise ProtocolError(
-                    f"{OBSERVATIONS} of {len(data):,} bytes; {MAX_OBSERVATIONS_BYTES:,} are the limit"
-                )
-            yield File(name=OBSERVATIONS, size=len(data), packed="as it is"), data
+    def _files(self) -> Iterator[tuple[File, list[bytes]]]:
+        """The files in pieces: once joined, each takes its memory again."""
+        yield (
+            File(name=ROWS, size=self._rows_size, packed="zstd"),
+            [*self._rows, self._compressor.flush()],
+        )
+        if self._npz is None or self._unstored or not self._n_packed:
+            return
+        try:
+            pieces = self._npz.finish()
+        except ProtocolError as error:
+            self._unstored = str(error)
+        else:
+            yield File(name=OBSERVATIONS, size=sum(map(len, pieces)), packed="as it is"), pieces
 
     def _taker(self, obs: Any, is_picture: bool) -> Callable[[Any], bool]:
         # Arrays are held outside the block: a block of pictures would be large.
@@ -187,12 +192,12 @@ class Renderer(Recorder):
         while self._held and (self._held_bytes > most or not most):
             name, rows = self._held.popleft()
             self._held_bytes -= getattr(rows, "nbytes", 0)
-            if self._npz is None or self._left_out:
+            if self._npz is None or self._left_out or self._unstored:
                 continue
             try:
                 self._npz.add(name, rows)
             except (ProtocolError, ValueError) as error:
-                self._left_out = str(error)
+                self._unstored = str(error)
 
 
 def _texts(steps: Sequence[Sequence[Any] | None], first: int, size: int) -> Iterator[bytes]:
@@ -233,7 +238,7 @@ class Container:
 
     def files(self) -> dict[str, bytes]:
         """The unpacked files by name. Raises ProtocolError when they are missing, too large, or of another size."""
-        if self.header.left_out or not self._files:
+        if not self._files:
             raise ProtocolError(self.header.left_out or "a rendered episode without files")
         try:
             return {file.name: _unpacked(file, data) for file, data in self._files.items()}
@@ -255,15 +260,17 @@ def decode(data: bytes) -> Trajectory:
     if log.n != container.header.n:
         raise ProtocolError(f"a rendered episode of {container.header.n} steps has a log of {log.n}")
     # Without files only the log remains.
-    files = {} if container.header.left_out else container.files()
+    files = container.files() if container.header.files or not container.header.left_out else {}
     return msgspec.structs.replace(
         log, record="full" if files else "actions", observations=container.header.observations, files=files
     )
 
 
 def checked_files(data: bytes, length: int, episode_return: float) -> dict[str, bytes]:
-    """The feedback files of a rendered episode. Raises ProtocolError when they do not match that length and return."""
-    files = Container(data).files()
+    """The feedback files of a rendered episode; `left_out.txt` says why observations are missing. Raises ProtocolError
+    when they do not match that length and return."""
+    container = Container(data)
+    files = container.files()
     rewards = _rewards(files.get(ROWS, b""))
     # In the same order as on the worker, as floating-point sums depend on it; `sum` would compensate.
     total = functools.reduce(operator.add, rewards, 0.0)
@@ -272,6 +279,8 @@ def checked_files(data: bytes, length: int, episode_return: float) -> dict[str, 
             f"{ROWS} has {len(rewards)} rows whose rewards come to {total!r}; {length} and {episode_return!r} were"
             " declared"
         )
+    if why := container.header.left_out:
+        files[LEFT_OUT] = f"{OBSERVATIONS} is left out: {why}\n".encode()
     return files
 
 
@@ -315,7 +324,7 @@ def files_of(episode: Trajectory, storage: ObsStorage | None) -> dict[str, bytes
         npz = NpzWriter()
         for name, leaf in columns.leaves(episode.obs):
             npz.add(name or SINGLE, leaf)
-        files[OBSERVATIONS] = npz.finish()
+        files[OBSERVATIONS] = b"".join(npz.finish())
     return files
 
 

@@ -120,13 +120,13 @@ class Recorder:
         self, obs: Any, action: Any, reward: float, terminated: bool, truncated: bool, info: dict[str, Any]
     ) -> None:
         """Records one step. `obs` and arrays in `action` are kept, not copied: they must not change afterwards."""
+        if not self._rewards:
+            self._begin_block(obs, action)
         if self._full:
-            if not self._rewards:
-                self._begin_block(obs)
             while not self._take(obs):
                 # Shape or dtype differs from the pictures before: start a new block of the kind that fits.
                 self._flush()
-                self._begin_block(obs)
+                self._begin_block(obs, action)
             self._infos.append(info)
         self._actions.append(action)
         self._rewards.append(reward)
@@ -140,13 +140,15 @@ class Recorder:
             self._flush()
         return b"".join([*self._parts, _LENGTH.pack(0)])
 
-    def _begin_block(self, obs: Any) -> None:
+    def _begin_block(self, obs: Any, action: Any) -> None:
         """Starts a block. Its first row alone decides its kind, so that equal rows give equal bytes."""
-        size = max(1, _size(obs))
-        is_picture = type(obs) is np.ndarray and size >= PICTURE_BYTES
-        n_bytes = PICTURES_BLOCK_BYTES if is_picture else BLOCK_BYTES
-        self._block_rows = max(1, min(BLOCK_ROWS, n_bytes // size))
-        self._take = self._taker(obs, is_picture)
+        most = MAX_BLOCK_BYTES // 2 // max(1, _size(action))
+        if self._full:
+            size = max(1, _size(obs))
+            is_picture = type(obs) is np.ndarray and size >= PICTURE_BYTES
+            most = min(most, (PICTURES_BLOCK_BYTES if is_picture else BLOCK_BYTES) // size)
+            self._take = self._taker(obs, is_picture)
+        self._block_rows = max(1, min(BLOCK_ROWS, most))
 
     def _taker(self, obs: Any, is_picture: bool) -> Callable[[Any], bool]:
         """Takes the observations of a block that begins with `obs`; returns False for one of another form."""

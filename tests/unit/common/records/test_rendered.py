@@ -20,6 +20,7 @@ from evopolicy_common.messages.environment import ObservationForm, ObsStorage
 from evopolicy_common.records.episodes import columns, rendered, trajectory
 from evopolicy_common.records.episodes.npz import NpzWriter, crc_of_both
 from evopolicy_common.records.episodes.rendered import (
+    LEFT_OUT,
     OBSERVATIONS,
     ROWS,
     Renderer,
@@ -132,7 +133,7 @@ def test_an_archive_is_whole_and_the_same_every_time() -> None:
         for t in range(30):
             writer.add("a/b", np.full((1, 9, 9), t, dtype=np.int16))
             writer.add("text", [f"ä{t}"])
-        return writer.finish()
+        return b"".join(writer.finish())
 
     assert archive() == archive()
     assert zipfile.ZipFile(io.BytesIO(archive())).testzip() is None
@@ -251,3 +252,24 @@ def test_files_that_cannot_be_made_are_left_out_and_the_log_stays(
     assert (decode(data).n, decode(data).record, decode(data).files) == (3, "actions", {})
     with pytest.raises(ProtocolError, match="100 are the limit"):
         checked_files(data, 3, 1.5)
+
+
+def test_pictures_beyond_the_bound_are_left_out_and_the_rows_stay(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(rendered, "MAX_RECORDED_BYTES", 40_000)
+    rng = np.random.default_rng(0)
+    for n, kept in ((2, {ROWS, OBSERVATIONS}), (4, {ROWS, LEFT_OUT})):
+        steps = [(rng.integers(0, 256, (64, 64, 3), np.uint8), t, 0.5) for t in range(n)]
+        data = recorded(Renderer("arrays", "npz"), steps)
+        files = checked_files(data, n, n / 2)
+        assert set(files) == kept
+        assert len(files[ROWS].splitlines()) == n
+        assert decode(data).record == "full"
+    assert b"observations.npz is left out: observations of more than 40,000 bytes" in files[LEFT_OUT]
+
+
+def test_blocks_of_large_actions_stay_within_their_bound(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(trajectory, "MAX_BLOCK_BYTES", 1 << 16)
+    steps = [(0, np.full(512, t, np.float64), 0.5) for t in range(100)]
+    for recorder in (Recorder("actions"), Recorder("full"), Renderer("arrays", "inline")):
+        actions = decode(recorded(recorder, steps)).actions
+        assert np.array_equal(actions, [action for _, action, _ in steps])

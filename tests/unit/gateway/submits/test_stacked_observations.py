@@ -71,7 +71,9 @@ def test_pictures_beside_the_rows_are_stacked_too(n: int, inline: bool) -> None:
     pictures = np.arange(n * 48 * 48, dtype=np.uint8).reshape(n, 48, 48)
     writer = NpzWriter()
     writer.add("observations", pictures)
-    files = as_published({"trajectory.jsonl": rows([None] * n), "observations.npz": writer.finish()})
+    files = as_published(
+        {"trajectory.jsonl": rows([None] * n), "observations.npz": b"".join(writer.finish())}
+    )
     if inline:
         assert shown(files) == pictures.tolist()
         assert sorted(files) == ["trajectory.jsonl"]

@@ -308,7 +308,7 @@ def test_only_a_calls_running_time_counts(
         assert guard.check(float(now)) == ""
     call.step = 7
     told = [guard.check(400.0 + k / 2) for k in range(14)]
-    assert told.index(hung("environment my/env, step 7", Limits(call_s=5.0))) > 10
+    assert told.index(hung("environment my/env, step 7", 5.0)) > 10
 
 
 @pytest.mark.parametrize("how", ["print", "threads", "close stdout"])

@@ -6,7 +6,7 @@ import msgspec
 import pytest
 from slots import QUICK, Slots, make_job, misbehaving
 
-from evopolicy_common.errors import WorkerError
+from evopolicy_common.errors import BrokenEnvironmentError
 from evopolicy_common.messages.episode import EpisodeOutcome, PolicyFailure
 from evopolicy_common.wire import codec
 from evopolicy_worker.episodes import loop as episodes
@@ -54,10 +54,10 @@ def test_the_largest_outcomes_of_a_job_can_be_handed_in(n: int) -> None:
         assert 327 * (inline_bytes(n) + len(msgspec.msgpack.encode(outcome))) <= codec.MAX_PACKED_BYTES
 
 
-def test_a_recording_that_no_coordinator_takes_is_the_workers_failure(
+def test_a_recording_that_no_coordinator_takes_is_the_environments_fault(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(codec, "MAX_BLOB_BYTES", 10)
     assert episodes._blob(b"x" * 10).size == 10
-    with pytest.raises(WorkerError, match="11 bytes; 10 are the limit"):
+    with pytest.raises(BrokenEnvironmentError, match="its recording has 11 bytes, and 10 are the limit"):
         episodes._blob(b"x" * 11)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from evopolicy_common.catalogue import Entry
+from evopolicy_common.catalogue import Entry, Wrapper
 from evopolicy_common.errors import SandboxError
 from evopolicy_worker.sandbox import user_code
 
@@ -34,6 +34,38 @@ def test_private_files_inside_a_package_are_hidden(tmp_path: Path) -> None:
     make(tmp_path, "pack/runs/e/v/x/run.json", "pack/state/identity.json", "pack/state/more/x")
     (tmp_path / "pack" / "linked").symlink_to(tmp_path / "outside")
     assert shown(tmp_path) == {"pack/__init__.py", "pack/a"}
+
+
+def test_a_link_shows_a_file_of_its_own_package_and_no_folder(tmp_path: Path) -> None:
+    make(tmp_path, "pack/__init__.py", "pack/.env", "pack/a.txt", "pack/sub/b.txt", "pack/run/run.json")
+    make(tmp_path, "outside/__init__.py", "outside/secret", "my_env.py", "pack/run/notes.txt", "near/x.txt")
+    targets = {"outside": "../outside/secret", "hidden": ".env", "of_run": "run/notes.txt", "folder": "sub"}
+    targets |= {"inside": "sub/b.txt", "nowhere": "gone", "itself": "itself", "by_link": "folder/b.txt"}
+    for name, target in targets.items():
+        (tmp_path / "pack" / name).symlink_to(target)
+    for name, target in {"linked": "outside", "x.libs": "outside", "b.py": "outside/secret"}.items():
+        (tmp_path / name).symlink_to(target)
+    (tmp_path / "alias.py").symlink_to("my_env.py")
+    own = {f"pack/{name}" for name in ("__init__.py", "a.txt", "sub", "inside", "by_link")}
+    assert shown(tmp_path) == {*own, "my_env.py", "alias.py", "outside"}
+    wrapper = Wrapper(wrapper="linked.secret:Key")
+    entry = Entry(id="my/x", gymnasium_id="b:X-v0", wrappers=(wrapper,))
+    assert user_code.declared([entry], [str(tmp_path)]) == []
+
+
+def test_links_in_a_folder_without_hidden_files_stay_links(tmp_path: Path) -> None:
+    """Their targets do not exist in the jail, unless they are shown by themselves."""
+    make(tmp_path, "pack/__init__.py", "pack/a.txt", "outside/secret")
+    (tmp_path / "pack" / "inside").symlink_to("a.txt")
+    assert shown(tmp_path) == {"pack"}
+
+
+def test_declared_data_may_be_a_link_within_its_folder(tmp_path: Path) -> None:
+    make(tmp_path, "levels/1.txt", "levels/own.pem", "state/identity.json", "state/x.txt")
+    for name, target in {"one": "levels/1.txt", "key": "levels/own.pem", "x": "state/x.txt"}.items():
+        (tmp_path / name).symlink_to(target)
+    entry = Entry(id="my/x", data=tuple(str(tmp_path / name) for name in ("one", "key", "x")))
+    assert user_code.declared([entry], []) == [str(tmp_path / "one"), str(tmp_path / "levels" / "1.txt")]
 
 
 def test_a_package_with_too_many_files_beside_hidden_ones_is_refused(tmp_path: Path) -> None:

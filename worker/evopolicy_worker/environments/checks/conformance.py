@@ -37,6 +37,7 @@ from evopolicy_worker.environments import registry
 from evopolicy_worker.environments.checks.episodes import digest, digest_of, rollout
 from evopolicy_worker.environments.interface import spaces
 from evopolicy_worker.environments.interface.base import Environment, Step
+from evopolicy_worker.environments.interface.trial import SEEDED
 
 SEEDS = (20_011_117, 20_011_229)
 """Large, so that an occurrence in an observation or info is recognisable as a leak."""
@@ -73,6 +74,8 @@ class CheckResult(msgspec.Struct, kw_only=True):
     """Whether a newly made environment played the same episode."""
     reused: bool = False
     """Whether the same environment, after another episode, played the same episode again."""
+    repeats: bool = True
+    """Whether its definition says that seed and actions determine an episode; otherwise none are compared."""
     rebuilt: bool = False
     """Whether it is made anew for each episode."""
     step_bytes: int = 0
@@ -86,11 +89,12 @@ class CheckResult(msgspec.Struct, kw_only=True):
     def verdict(self, other: CheckResult | None) -> str:
         """`ok`, or all violations. `other`: the result in another process."""
         wrong = list(self.faults)
-        if not wrong:
+        if not wrong and self.repeats:
             wrong += [] if self.fresh else ["a fresh one plays another episode"]
             wrong += [] if self.reused else ["a reused one plays another episode"]
             if other is not None and other.digest != self.digest:
                 wrong.append("another process plays another episode")
+            wrong += [SEEDED] if wrong else []
         return "; ".join(wrong) or "ok"
 
 
@@ -112,6 +116,7 @@ def _play(played: CheckResult, steps: int) -> None:
     environment = registry.make(played.env)
     description = environment.description
     played.limit, played.rebuilt = description.max_episode_steps, environment.rebuilds
+    played.repeats = description.deterministic
     with _no_pickles(played):
         first = digest_of(_checked(played, environment, steps))
     played.digest = first
@@ -134,6 +139,8 @@ def _rendered(played: CheckResult, plain: Environment, steps: int) -> str:
     drawn.close()
     if there == digest(plain, SEEDS[0], steps):
         return "same"
+    if not played.repeats:
+        return "differs"
     played.faults.append("an episode that is drawn is another one")
     return "differs"
 

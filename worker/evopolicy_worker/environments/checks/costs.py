@@ -22,6 +22,7 @@ from evopolicy_common.processes import proc
 from evopolicy_common.processes.parent_death import end_with_parent
 from evopolicy_worker.environments import registry
 from evopolicy_worker.environments.interface import settings
+from evopolicy_worker.environments.interface.actions import copied
 from evopolicy_worker.environments.interface.gymnasium_adapter import GymnasiumEnvironment
 
 CASE = Case(seed=20_011_117)
@@ -60,9 +61,9 @@ def _stretch(environment: GymnasiumEnvironment) -> list[Any]:
 
 def _play(environment: GymnasiumEnvironment, actions: list[Any]) -> Stretch:
     environment.reset(CASE)
-    step = environment.bare.step
+    step, sent = environment.bare.step, list(map(copied, actions))
     below, began = proc.cpu_below_s(os.getpid()), time.process_time()
-    for action in actions:
+    for action in sent:
         step(action)
     own = time.process_time() - began
     return Stretch(own + proc.cpu_below_s(os.getpid()) - below, [literal(each) for each in actions])

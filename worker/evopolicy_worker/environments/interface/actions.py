@@ -20,6 +20,7 @@ Works from the schema of the action space alone, compiled once: `repair` runs on
 from __future__ import annotations
 
 import contextlib
+import copy
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from typing import Any
@@ -351,6 +352,13 @@ class _Graph(ActionCodec):
         from gymnasium.spaces import GraphInstance
 
         return GraphInstance(nodes, edges, links)
+
+
+def copied(action: Any) -> Any:
+    """The same valid action for the simulator alone: some change theirs in place, and what was sent is recorded."""
+    if type(action) is np.ndarray:
+        return action.copy()
+    return action if type(action) is int else copy.deepcopy(action)
 
 
 _CODECS: dict[str, Callable[[SpaceSchema], ActionCodec]] = {

@@ -25,6 +25,8 @@ Kind = Literal["", "make", "reset", "step", "render", "close"]
 
 NOTE = "note: "
 """Prefix of a line on the process's standard error that an operator should see."""
+CLOSE_S = 30.0
+"""Longest that `close` may take, seconds: nothing is computed in it, and a worker does not register meanwhile."""
 _LONGEST_CHECK_S = 1.0
 """More time between two checks does not count: this process was not let run."""
 _MEMORY_CHECK_S = 0.5
@@ -98,8 +100,9 @@ class Guard:
         since = min(now - self._checked, _LONGEST_CHECK_S)
         self._spent_s = self._spent_s + since if call == self._call and call[1] else 0.0
         self._checked, self._call = now, call
-        if self._spent_s > self._limits.call_s:
-            return hung(str(current), self._limits)
+        most_s = min(self._limits.call_s, CLOSE_S) if call[1] == "close" else self._limits.call_s
+        if self._spent_s > most_s:
+            return hung(str(current), most_s)
         if now - self._weighed >= _MEMORY_CHECK_S:
             self._weighed = now
             used = resident_bytes()
@@ -112,11 +115,11 @@ class Guard:
         return ""
 
 
-def hung(call: str, limits: Limits) -> str:
-    """The text for a call that does not return."""
+def hung(call: str, most_s: float) -> str:
+    """The text for a call that has not returned for so many seconds."""
     return (
-        f"{call}: it has not returned for {limits.call_s:g} s, the limit of one call; correct the environment, or raise"
-        " the worker's --env-timeout"
+        f"{call}: it has not returned for {most_s:g} s, the limit of one call; correct the environment (child processes"
+        " ignore SIGTERM here: end them with SIGKILL), or raise the worker's --env-timeout"
     )
 
 

@@ -8,6 +8,7 @@ their family is made, and not before: this module imports none.
 from __future__ import annotations
 
 import contextlib
+import copy
 import difflib
 import importlib
 import io
@@ -18,18 +19,18 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from evopolicy_common.catalogue import USUAL_STEPS, Entry, Wrapper, is_shipped
+from evopolicy_common.catalogue import MAX_STEPS, USUAL_STEPS, Entry, Wrapper, is_shipped
 from evopolicy_common.errors import EvopolicyError, WorkerError
 from evopolicy_common.installation import add_extra
 from evopolicy_common.messages.environment import Case, EnvironmentDescription, SpaceSchema
 from evopolicy_worker.environments.accelerations import accelerate
 from evopolicy_worker.environments.interface import rewards, settings, spaces, trial
-from evopolicy_worker.environments.interface.actions import ActionCodec, compile_actions
+from evopolicy_worker.environments.interface.actions import ActionCodec, compile_actions, copied
 from evopolicy_worker.environments.interface.base import Environment, Frame, Observation, Step
 from evopolicy_worker.environments.interface.calls import current as call
 from evopolicy_worker.environments.interface.calls import described
 from evopolicy_worker.environments.interface.fingerprint import adapter, versions
-from evopolicy_worker.environments.interface.info import plain_info
+from evopolicy_worker.environments.interface.info import OURS, THEIRS, plain_info
 from evopolicy_worker.environments.interface.observations import compile_observation
 from evopolicy_worker.environments.interface.opaque import Opaque, converter, declared, visible
 from evopolicy_worker.environments.tasks import task_text
@@ -92,7 +93,7 @@ class GymnasiumFamily:
         assert entry.gymnasium_id is not None
         # Passed only when needed: not every environment accepts a render mode.
         mode: dict[str, Any] = {"render_mode": "rgb_array"} if render else {}
-        options = {"disable_env_checker": True, **entry.kwargs}
+        options = {"disable_env_checker": True, **copy.deepcopy(entry.kwargs)}
         try:
             return gymnasium.make(entry.gymnasium_id, **mode, **options)
         except TypeError as error:
@@ -212,6 +213,7 @@ class GymnasiumEnvironment(Environment):
         words, spec = family.words(entry, self.bare), self.bare.spec
         about = About(entry, self.bare, obs_schema, action_schema, components, self._limit, words)
         made: dict[str, Any] = {"gymnasium_id": entry.gymnasium_id, "kwargs": entry.kwargs}
+        made["reset_options"] = entry.reset_options
         made["wrappers"] = [{"wrapper": each.wrapper, "kwargs": each.kwargs} for each in entry.wrappers]
         self.solved_by = family.solved_by.get(entry.gymnasium_id or "", "")
         self.description = EnvironmentDescription(
@@ -253,9 +255,11 @@ class GymnasiumEnvironment(Environment):
             self._build()
         self._family.begin()
         self._used = True
-        self._options_used, self._steps = case.options is not None, 0
+        given = {**self._entry.reset_options, **(case.options or {})}
+        self._options_used, self._steps = bool(given) or case.options is not None, 0
         call.begin(env_id, "reset")
-        returned = self.bare.reset(seed=case.seed, options=case.options)
+        options = copy.deepcopy(given) if self._options_used else None
+        returned = self.bare.reset(seed=case.seed, options=options)
         if self._promises is not None:
             self._promises.after_reset(returned)
         obs, _ = returned
@@ -273,6 +277,7 @@ class GymnasiumEnvironment(Environment):
     def step(self, action: Any) -> Step:
         call.step = self._steps
         call.what = "step"
+        action = copied(action)
         if self._decode is not None:
             action = self._decode(action)
         returned = self.bare.step(action)
@@ -282,6 +287,8 @@ class GymnasiumEnvironment(Environment):
             if self._encode is not None:
                 obs = self._encode(obs)
             plain = self._family.info(info)
+            if not OURS.isdisjoint(plain):
+                plain = {f"{THEIRS}{key}" if key in OURS else key: value for key, value in plain.items()}
             plain["steps"] = self._steps
             if self._rewards is not None:
                 reward = self._rewards.scalar(reward, plain)
@@ -328,7 +335,7 @@ class GymnasiumEnvironment(Environment):
         while type(env).__name__ in _PLAIN_WRAPPERS:
             limits.append(getattr(env, "_max_episode_steps", None) or 0)
             env = env.env  # type: ignore[attr-defined]
-        self._limit = min(filter(None, limits), default=USUAL_STEPS)
+        self._limit = min(MAX_STEPS, min(filter(None, limits), default=USUAL_STEPS))
         self.accelerations = ()
         if self._factors:  # No acceleration is proved for other parameters.
             self._multiply(env)
@@ -381,7 +388,7 @@ def _wrapped(env_id: str, env: gymnasium.Env[Any, Any], wrapper: Wrapper) -> gym
             f"{where}: its module {path!r} raised {type(error).__name__}: {error} on import; correct the module"
         ) from error
     try:
-        made: gymnasium.Env[Any, Any] = make(env, **wrapper.kwargs)
+        made: gymnasium.Env[Any, Any] = make(env, **copy.deepcopy(wrapper.kwargs))
     except Exception as error:
         raise WorkerError(
             f"{where}, kwargs {wrapper.kwargs}: it cannot be put around the environment: {type(error).__name__}:"

@@ -1,6 +1,7 @@
 """The part of a simulator's `info` that goes into a trajectory: plain scalars, short strings, short lists, one level
 of dicts.
 
+The keys `OURS` are ours in every row; an environment's own values under them get the prefix `THEIRS`.
 Values that name a seed, and values of the simulator's own types, are left out. The result can be encoded as JSON and
 msgpack (the trajectory codec encodes NaN and infinities).
 """
@@ -17,7 +18,9 @@ MAX_ELEMENTS = 16
 """Longer arrays, lists and nested dicts are dropped."""
 MAX_CHARACTERS = 256
 """Longer strings are dropped."""
-
+OURS = frozenset({"steps", "action_invalid", "policy_failed"})
+"""Number of steps so far, and the marks of an action that was repaired, and of one in place of a failed policy's."""
+THEIRS = "environment."
 
 _SCALARS: dict[type, Callable[[Any], Any]] = {
     **dict.fromkeys((float, bool), lambda value: value),

@@ -1,20 +1,23 @@
 """Checks of environments that do not ship: in every episode, and in a few random steps before they are offered.
 
 Spaces must not change, observations must have the form of their space, and rewards must be finite. In the trial, an
-observation beyond the bounds of its space is refused. In an episode, the operator gets a report of the first one, since
+observation beyond the bounds of its space is refused, and so is another episode of the same seed and actions, unless
+the definition says so. In an episode, the operator gets a report of the first one, since
 a policy can drive an imprecise environment there.
 """
 
 from __future__ import annotations
 
+import hashlib
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 import numpy as np
 
 from evopolicy_common.errors import EvopolicyError, WorkerError
 from evopolicy_common.messages.environment import Case, SpaceSchema
+from evopolicy_common.records.episodes import columns
 from evopolicy_common.terminal import one_line
 from evopolicy_worker.environments.interface import spaces
 from evopolicy_worker.environments.interface.base import Environment, Step
@@ -22,7 +25,12 @@ from evopolicy_worker.environments.interface.calls import current as call
 from evopolicy_worker.environments.interface.calls import described, note
 
 STEPS = 32
-SEEDS = (0, 1)
+SEEDS = (0, 1, 0)
+SEEDED = (
+    "draw from self.np_random alone, which super().reset(seed=seed) seeds, or say deterministic = false in an"
+    " environment file"
+)
+"""The remedy for an environment that does not repeat an episode."""
 _OF_FORM = "an array of shape"
 _WRAP = "; if it is not yours, name a wrapper that corrects it in an environment file (wrappers)"
 _ROUNDING = 1e-6
@@ -174,23 +182,48 @@ def solved(told: Any) -> bool | None:
 
 def play(environment: Environment) -> None:
     """Plays random episodes of a few steps. Raises WorkerError that names the environment, the field and the remedy."""
-    rng = np.random.default_rng(0)
+    earlier: dict[int, list[dict[str, bytes]]] = {}
     try:
         for seed in SEEDS:
-            environment.reset(Case(seed=seed))
-            for _ in range(STEPS):
-                try:
-                    action = environment.action_codec.sample(rng)
-                except Exception as error:
+            played = [_digests(step) for step in _steps(environment, seed)]
+            again = zip(earlier.get(seed, played), played, strict=False)
+            for n, (one, other) in enumerate(again if environment.description.deterministic else ()):
+                if fields := [name for name in one | other if one.get(name) != other.get(name)]:
+                    where = f"environment {environment.description.env}, {f'step {n - 1}' if n else 'reset'}"
                     raise WorkerError(
-                        f"environment {environment.description.env}, action_space: no random action can be drawn from"
-                        f" it ({type(error).__name__}: {error}); correct its bounds"
-                    ) from error
-                step = environment.step(action)
-                if step.terminated or step.truncated:
-                    break
+                        f"{where}, {fields[0]}: it is another one when seed {seed} and the same actions are played"
+                        f" again; {SEEDED}"
+                    )
+            earlier[seed] = played
     except EvopolicyError:
         raise
     except BaseException as error:  # such as an environment's sys.exit
         wanted = "seed" if call.what == "reset" else "action of its action_space"
         raise WorkerError(f"{call}: it raised {described(error)}; it has to take any {wanted}") from error
+
+
+def _steps(environment: Environment, seed: int) -> Iterator[Step]:
+    """The first observation, and the steps that follow random actions."""
+    rng = np.random.default_rng(seed)
+    step = Step(environment.reset(Case(seed=seed)), 0.0, False, False, {})
+    yield step
+    for _ in range(STEPS):
+        try:
+            action = environment.action_codec.sample(rng)
+        except Exception as error:
+            raise WorkerError(
+                f"environment {environment.description.env}, action_space: no random action can be drawn from"
+                f" it ({type(error).__name__}: {error}); correct its bounds"
+            ) from error
+        step = environment.step(action)
+        yield step
+        if step.terminated or step.truncated:
+            return
+
+
+def _digests(step: Step) -> dict[str, bytes]:
+    """By field, and of an info by key, digests that are equal for equal bits only."""
+    obs, reward, terminated, truncated, info = step
+    fields = {"observation": obs, "reward": reward, "terminated": terminated, "truncated": truncated}
+    fields |= {f"info[{key!r}]": value for key, value in info.items()}
+    return {name: hashlib.sha256(columns.encode(value)).digest() for name, value in fields.items()}
