@@ -5,13 +5,13 @@
   has been stopped: the agent has ended then and cannot write the reward.
 - A verifier's request reports the end of its run's agent, as `evopolicy finish` does, and gets the score once it is
   there.
-- Every request needs the token, which only the tasks' `tests/` have: Harbor's verifier gets them, its agent does not.
+- Every request needs its task's token, which only the task's `tests/` have: Harbor's verifier gets them, its agent does
+  not.
 - Nothing but a run's score is told, and only after the run is finished.
 """
 
 from __future__ import annotations
 
-import contextlib
 import hmac
 import json
 import re
@@ -140,7 +140,9 @@ def write_task(tasks: Path, run: Path, url: str, agent_s: float) -> Path:
         if other.resolve() != folder.root.resolve():
             raise ConfigError(f"{place} is already the task of {other}; name another folder with --tasks")
     env = saved(folder.intended, IntendedRun).settings.env
-    files = task_files(folder, env=env, url=f"{url}/{place.name}", token=token_of(tasks), agent_s=agent_s)
+    files = task_files(
+        folder, env=env, url=f"{url}/{place.name}", token=token_of(tasks, place.name), agent_s=agent_s
+    )
     for name, text in files.items():
         path = place / name
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -149,14 +151,13 @@ def write_task(tasks: Path, run: Path, url: str, agent_s: float) -> Path:
     return place
 
 
-def token_of(tasks: Path) -> str:
-    """The token of all tasks in a folder, which stays the same when they are served again."""
+def token_of(tasks: Path, task: str) -> str:
+    """The token of a task in a folder, which stays the same when it is served again. Other tasks have others."""
     path = tasks / ".token"
-    with contextlib.suppress(FileNotFoundError):
-        return path.read_text().strip()
-    tasks.mkdir(parents=True, exist_ok=True)
-    write_atomically(path, f"{secrets.token_hex(32)}\n".encode(), mode=0o600)
-    return path.read_text().strip()
+    if not path.exists():
+        tasks.mkdir(parents=True, exist_ok=True)
+        write_atomically(path, f"{secrets.token_hex(32)}\n".encode(), mode=0o600)
+    return hmac.digest(path.read_bytes().strip(), task.encode(), "sha256").hex()
 
 
 def tasks_in(tasks: Path) -> dict[str, RunFolder]:
@@ -173,13 +174,13 @@ def _run_of(path: Path) -> RunFolder:
         ) from error
 
 
-def make_app(runs: Mapping[str, RunFolder], token: str) -> Starlette:
+def make_app(runs: Mapping[str, RunFolder], tasks: Path) -> Starlette:
     """The service of the scores: `POST /TASK`."""
 
     async def answer(request: Request) -> Response:
-        given = request.headers.get("authorization", "")
-        folder = runs.get(request.path_params["task"])
-        if not hmac.compare_digest(given.encode(), f"Bearer {token}".encode()):
+        given, task = request.headers.get("authorization", ""), request.path_params["task"]
+        folder = runs.get(task)
+        if not hmac.compare_digest(given.encode(), f"Bearer {token_of(tasks, task)}".encode()):
             text, status = "wrong or missing token", 401
         elif folder is None:
             text, status = "no such task", 404
@@ -258,7 +259,7 @@ async def _serve(listener: Listener, runs: list[Path], tasks: Path, agent_s: flo
     known = tasks_in(tasks)
     if not known:
         raise ConfigError(f"{tasks} has no tasks; name open runs, such as runs/theirs/gym_acrobot/first")
-    async with serving(make_app(known, token_of(tasks)), sock) as task:
+    async with serving(make_app(known, tasks), sock) as task:
         command = f"harbor run --path {tasks} --agent AGENT --model MODEL"
         say(f"scores are served at {url}; next, in another terminal: {command}")
         await task

@@ -9,6 +9,7 @@ from __future__ import annotations
 import asyncio
 import ctypes
 import logging
+import resource
 import signal
 import socket
 import sys
@@ -27,6 +28,10 @@ from evopolicy_gateway.relay.usage import Prices
 _PR_SET_DUMPABLE = 4
 _TELL_S = 60.0
 """Time between notes of the use so far, seconds."""
+_DRAIN_S = 5.0
+"""Time in which answers may still come, and be counted, after the run's end, seconds."""
+MAX_MEMORY_BYTES = 1 << 30
+"""Of the process: all that it may hold and one document that is read, with some space."""
 
 
 async def tell(
@@ -52,7 +57,9 @@ async def _main(fd: int) -> None:
     order = msgspec.convert(first.order, Order)
 
     def counted(note: str = "") -> None:
-        child_messages.emit(AgentDoing(tokens=relay.used.recorded(order.prices), note=note))
+        used = relay.used
+        tokens = used.recorded(order.prices) | {"requests": used.requests}
+        child_messages.emit(AgentDoing(tokens=tokens, note=note))
 
     def spent(what: str) -> None:
         child_messages.emit(ModelBudgetSpent(what=what))
@@ -68,11 +75,12 @@ async def _main(fd: int) -> None:
         while await orders.next() is not None:
             pass
         telling.cancel()
-    await relay.close()
+    await relay.close(_DRAIN_S)
 
 
 if __name__ == "__main__":
     # No other process of this user may read its memory, which has the key.
     ctypes.CDLL(None).prctl(_PR_SET_DUMPABLE, 0, 0, 0, 0)
+    resource.setrlimit(resource.RLIMIT_DATA, (MAX_MEMORY_BYTES, MAX_MEMORY_BYTES))
     setup_logging()
     asyncio.run(_main(int(sys.argv[1])))

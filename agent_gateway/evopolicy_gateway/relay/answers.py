@@ -1,8 +1,7 @@
 """Reads token counts from a model API's answers, in JSON or as a stream of events (SSE). No I/O.
 
 Each API is one row of `SHAPES`. An answer is whatever its sender says: a count that is no count is estimated from the
-text, at
-`CHARS_PER_TOKEN`, and so is one that a broken stream or a server without counts did not send.
+text, at `CHARS_PER_TOKEN`, and so is one that a broken stream or a server without counts did not send.
 """
 
 from __future__ import annotations
@@ -17,76 +16,89 @@ import orjson
 from evopolicy_gateway.relay.usage import Usage
 
 MAX_EVENT_BYTES = 16 << 20
-"""Most bytes of one event, or of an answer in JSON, that are read for counts; longer ones pass on unread."""
+"""Most bytes of one event, or of an answer in JSON; a longer one breaks off."""
 MAX_TOKENS = 10**8
 """Limit of one request's count, above any model's context; a larger one is not believed."""
 CHARS_PER_TOKEN = 4
 _MAX_NAME = 200
 _EVENT_END = re.compile(rb"\r\n\r\n|\n\n|\r\r")
-_KINDS = ("input", "cache_read", "cache_creation", "output", "reasoning")
 
 
 class Shape(msgspec.Struct, frozen=True, kw_only=True):
     """Where an API's answers and events tell counts, as dotted paths."""
 
-    usage: tuple[str, ...]
+    usage: tuple[str, ...] = ("usage",)
     """Objects with counts; a later count replaces an earlier one."""
-    counts: dict[str, str]
-    """Path within such an object by kind."""
-    input_includes_cached: bool
-    model: tuple[str, ...]
-    text: tuple[str, ...]
+    counts: dict[str, tuple[str, ...]] = {}
+    """Paths within such an object by kind. Their counts are added; of cached tokens, servers tell one of these."""
+    input_includes_cached: bool = True
+    model: tuple[str, ...] = ("model",)
+    tier: tuple[str, ...] = ("service_tier",)
+    """Service tier that served the request."""
+    text: tuple[str, ...] = ()
     """The model's own texts, for an estimate."""
-    last: frozenset[str]
+    last: frozenset[str] = frozenset()
     """`type` of the events after which no count follows."""
 
 
+FREE = Shape()
+"""Of an answer that costs nothing."""
 SHAPES: dict[str, Shape] = {
     "chat/completions": Shape(
-        usage=("usage",),
+        usage=("usage", "choices.*.usage"),
         counts={
-            "input": "prompt_tokens",
-            "cache_read": "prompt_tokens_details.cached_tokens",
-            "output": "completion_tokens",
-            "reasoning": "completion_tokens_details.reasoning_tokens",
+            "input": ("prompt_tokens",),
+            "cache_read": ("prompt_tokens_details.cached_tokens", "prompt_cache_hit_tokens", "cached_tokens"),
+            "output": ("completion_tokens",),
+            "reasoning": ("completion_tokens_details.reasoning_tokens",),
         },
-        input_includes_cached=True,
-        model=("model",),
         text=tuple(
             f"choices.*.{part}.{field}"
             for part in ("delta", "message")
             for field in ("content", "reasoning_content", "reasoning", "tool_calls.*.function.arguments")
         ),
-        last=frozenset(),
     ),
     "responses": Shape(
         usage=("usage", "response.usage"),
         counts={
-            "input": "input_tokens",
-            "cache_read": "input_tokens_details.cached_tokens",
-            "output": "output_tokens",
-            "reasoning": "output_tokens_details.reasoning_tokens",
+            "input": ("input_tokens",),
+            "cache_read": ("input_tokens_details.cached_tokens",),
+            "output": ("output_tokens",),
+            "reasoning": ("output_tokens_details.reasoning_tokens",),
         },
-        input_includes_cached=True,
         model=("model", "response.model"),
+        tier=("service_tier", "response.service_tier"),
         text=("delta", "output.*.content.*.text", "output.*.arguments"),
         last=frozenset(("response.completed", "response.incomplete", "response.failed")),
     ),
     "messages": Shape(
         usage=("message.usage", "usage"),
         counts={
-            "input": "input_tokens",
-            "cache_read": "cache_read_input_tokens",
-            "cache_creation": "cache_creation_input_tokens",
-            "output": "output_tokens",
+            "input": ("input_tokens",),
+            "cache_read": ("cache_read_input_tokens",),
+            "cache_creation": ("cache_creation_input_tokens",),
+            "output": ("output_tokens",),
         },
         input_includes_cached=False,
         model=("model", "message.model"),
+        tier=("usage.service_tier", "message.usage.service_tier", "usage.speed", "message.usage.speed"),
         text=("delta.text", "delta.thinking", "delta.partial_json", "content.*.text", "content.*.thinking"),
         last=frozenset(("message_stop",)),
     ),
+    "generateContent": Shape(
+        usage=("usageMetadata",),
+        counts={
+            "input": ("promptTokenCount", "toolUsePromptTokenCount"),
+            "cache_read": ("cachedContentTokenCount",),
+            "output": ("candidatesTokenCount", "thoughtsTokenCount"),
+            "reasoning": ("thoughtsTokenCount",),
+        },
+        model=("modelVersion",),
+        tier=("usageMetadata.serviceTier",),
+        text=("candidates.*.content.parts.*.text", "candidates.*.content.parts.*.functionCall.name"),
+    ),
 }
-"""By the last part of the API's path."""
+"""By `apis.Route.api`."""
 
 
 class AnswerReader:
@@ -101,32 +113,34 @@ class AnswerReader:
         self._events = events
         self._drops_usage = drops_usage
         self._held = bytearray()
-        self._unread = False
         self._counts: dict[str, int] = {}
+        """By path."""
         self._wrong: set[str] = set()
         self._chars = 0
-        self._model = ""
+        self._model = self._tier = ""
+
+    @property
+    def held(self) -> int:
+        """Bytes of an event, or of a document, that is not whole yet."""
+        return len(self._held)
 
     def feed(self, data: bytes) -> bytes:
         """Reads the next bytes. Returns those that pass on: whole events, and all of a JSON document at once with
-        `end`."""
+        `end`. Raises ValueError for an event that is too long."""
         searched = max(0, len(self._held) - 3)
         self._held += data
-        if len(self._held) > MAX_EVENT_BYTES:
-            passed, self._unread = bytes(self._held), True
-            self._held.clear()
-            # All of it may be the model's text: the estimate must not be lower than what was generated.
-            self._chars += len(passed)
-            return passed
-        if not self._events:
-            return b""
         out, at = [], 0
-        for match in _EVENT_END.finditer(self._held, searched):
+        for match in _EVENT_END.finditer(self._held, searched) if self._events else ():
             event = bytes(self._held[at : match.end()])
             at = match.end()
             if not (self._read_event(event) and self._drops_usage):
                 out.append(event)
         del self._held[:at]
+        if len(self._held) > MAX_EVENT_BYTES:
+            # All of it may be the model's text: the estimate must not be lower than what was generated.
+            self._chars += len(self._held)
+            self._held.clear()
+            raise ValueError(f"the answer has an event of more than {MAX_EVENT_BYTES:,} bytes")
         return b"".join(out)
 
     def end(self) -> bytes:
@@ -135,20 +149,24 @@ class AnswerReader:
         self._held.clear()
         if not self._events:
             self._read(_decoded(rest))
-            self.complete = not self._unread
         elif rest:
             self._read_event(rest)
+        # A stream of an API that names its last event is whole only with it.
+        self.complete = self.complete or not self._events or not self._shape.last
         return rest
 
-    def metered(self, request_bytes: int) -> dict[str, Any]:
-        """The counts so far, as fields of a `limits.Request`. `request_bytes`: of the request, for an estimate of the
-        input."""
-        tokens, guessed = dict(self._counts), set(self._wrong)
-        told = self.complete or not self._shape.last
+    def metered(self, input_tokens: int) -> dict[str, Any]:
+        """The counts so far, as fields of a `limits.Request`. `input_tokens`: estimated from the request."""
+        guessed = set(self._wrong)
+        tokens: dict[str, int] = {}
+        for kind, paths in self._shape.counts.items():
+            told = [self._counts[path] for path in paths if path in self._counts]
+            if told:
+                tokens[kind] = max(told) if kind == "cache_read" else sum(told)
         if "input" not in tokens:
-            tokens["input"] = request_bytes // CHARS_PER_TOKEN
+            tokens["input"] = input_tokens
             guessed.add("input")
-        if "output" not in tokens or not told:
+        if "output" not in tokens or not self.complete:
             tokens["output"] = max(tokens.get("output", 0), self._chars // CHARS_PER_TOKEN)
             guessed.add("output")
         cached = tokens.get("cache_read", 0)
@@ -164,7 +182,7 @@ class AnswerReader:
             output=tokens["output"],
             reasoning=None if reasoning is None else min(reasoning, tokens["output"]),
         )
-        return {"usage": usage, "estimated": bool(guessed), "answered": self._model}
+        return {"usage": usage, "estimated": bool(guessed), "answered": self._model, "tier": self._tier}
 
     def _read_event(self, event: bytes) -> bool:
         """Returns whether the event has counts alone."""
@@ -176,30 +194,33 @@ class AnswerReader:
         return self._read(_decoded(data))
 
     def _read(self, document: Any) -> bool:
+        if isinstance(document, list):
+            # Google's stream without events is one list of documents.
+            for each in document:
+                self._read(each if isinstance(each, dict) else None)
         if not isinstance(document, dict):
             return False
         shape, told = self._shape, False
         for path in shape.usage:
             for counts in values(document, path):
-                for kind in shape.counts if isinstance(counts, dict) else ():
-                    for value in values(counts, shape.counts[kind]):
-                        told = self._count(kind, value) or told
-        for path in shape.model:
-            for name in values(document, path):
-                self._model = name[:_MAX_NAME] if isinstance(name, str) else self._model
+                for name in dict.fromkeys(each for paths in shape.counts.values() for each in paths):
+                    for value in values(counts, name):
+                        told = self._count(name, value) or told
+        self._model = _name(document, shape.model) or self._model
+        self._tier = _name(document, shape.tier) or self._tier
         for path in shape.text:
             self._chars += sum(len(text) for text in values(document, path) if isinstance(text, str))
         self.complete = self.complete or document.get("type") in shape.last
         return told and document.get("choices") == []
 
-    def _count(self, kind: str, value: Any) -> bool:
+    def _count(self, path: str, value: Any) -> bool:
         """Takes a count; a missing one (null) is none."""
         if value is None:
             return False
         if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value <= MAX_TOKENS:
-            self._wrong.add(kind)
+            self._wrong.add(path)
             return False
-        self._counts[kind] = value
+        self._counts[path] = value
         return True
 
 
@@ -228,31 +249,13 @@ def values(document: Any, path: str) -> Iterator[Any]:
             yield value
 
 
+def _name(document: Any, paths: tuple[str, ...]) -> str:
+    found = [each for path in paths for each in values(document, path) if isinstance(each, str)]
+    return found[-1][:_MAX_NAME] if found else ""
+
+
 def _decoded(data: bytes) -> Any:
     try:
         return orjson.loads(data)
     except orjson.JSONDecodeError:
         return None
-
-
-class Cleaner:
-    """Takes secrets out of a stream of bytes, also one that is divided between pieces."""
-
-    def __init__(self, secrets: tuple[bytes, ...]) -> None:
-        self._secrets = secrets
-        self._held = b""
-
-    def feed(self, data: bytes) -> bytes:
-        """The bytes that may go on. An end that could begin a secret is held back until more is known."""
-        data = self._held + data
-        for secret in self._secrets:
-            data = data.replace(secret, b"[key]")
-        starts = (secret[:n] for secret in self._secrets for n in range(1, len(secret)))
-        held = max((len(start) for start in starts if data.endswith(start)), default=0)
-        self._held = data[len(data) - held :]
-        return data[: len(data) - held]
-
-    def end(self) -> bytes:
-        """The bytes that are held back at the end of the stream."""
-        rest, self._held = self._held, b""
-        return rest

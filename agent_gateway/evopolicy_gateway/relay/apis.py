@@ -13,7 +13,42 @@ import msgspec
 Protocol = Literal["openai", "anthropic", "google"]
 
 
-_PASSED_QUERY = ("beta", "client_version", "limit")
+class _Vendor(NamedTuple):
+    """A protocol's paths and key."""
+
+    version: str
+    """Begins the provider's paths; the agent may leave it out."""
+    paths: str
+    """Pattern of the paths after the version."""
+    key_header: str
+
+
+_VENDORS: dict[Protocol, _Vendor] = {
+    "openai": _Vendor("", "chat/completions|responses|models", "authorization"),
+    "anthropic": _Vendor("v1/", "messages|messages/count_tokens|models", "x-api-key"),
+    "google": _Vendor(
+        "v1beta/",
+        r"models|models/(?P<model>[\w.-]+):(?P<method>generateContent|streamGenerateContent|countTokens)",
+        "x-goog-api-key",
+    ),
+}
+_FREE = ("models", "messages/count_tokens", "countTokens")
+_PASSED_QUERY = ("alt", "beta", "client_version", "limit", "pageSize", "pageToken")
+
+
+class Route(NamedTuple):
+    """One path of an API."""
+
+    path: str
+    """At the provider, below the base URL."""
+    name: str
+    """The path without its version, by which a call is recorded."""
+    api: str
+    """Key of `answers.SHAPES` and `requests.RULES`, or the name of a path that is free."""
+    free: bool
+    """Whether its requests cost no tokens."""
+    model: str | None
+    """The model that the path names."""
 
 
 class Upstream(msgspec.Struct, frozen=True, kw_only=True):
@@ -21,15 +56,26 @@ class Upstream(msgspec.Struct, frozen=True, kw_only=True):
 
     protocol: Protocol
     base_url: str
-    """As the vendor's library takes it: OpenAI's with `/v1`, Anthropic's without."""
+    """As the vendor's library takes it: OpenAI's with `/v1`, the others' without a version."""
     key: str = ""
     key_header: str = ""
     """Header with the key; empty: the protocol's own. `authorization` takes it as a bearer token."""
     headers: dict[str, str] = {}
     query: dict[str, str] = {}
 
+    def route(self, path: str) -> Route | None:
+        """The route of a path at the relay; None for one that is not served."""
+        vendor = _VENDORS[self.protocol]
+        name = path.strip("/").removeprefix(vendor.version or "v1/")
+        match = re.fullmatch(vendor.paths, name, re.ASCII)
+        if match is None:
+            return None
+        found = match.groupdict()
+        api = (found.get("method") or name).replace("streamGenerate", "generate")
+        return Route(vendor.version + name, name, api, api in _FREE, found.get("model"))
+
     def url(self, path: str, asked: Mapping[str, str]) -> str:
-        """The address of an API by its path below the base, such as `responses`. `asked`: the agent's query."""
+        """The address of a `Route.path`. `asked`: the agent's query."""
         query = {name: asked[name] for name in _PASSED_QUERY if name in asked} | self.query
         return f"{self.base_url.rstrip('/')}/{path}" + (f"?{urlencode(query)}" if query else "")
 
@@ -43,46 +89,14 @@ class Upstream(msgspec.Struct, frozen=True, kw_only=True):
         """The headers that the provider wants besides the agent's."""
         if not self.key:
             return dict(self.headers)
-        name = self.key_header.lower() or {"openai": "authorization", "anthropic": "x-api-key"}[self.protocol]
+        name = self.key_header.lower() or _VENDORS[self.protocol].key_header
         return {**self.headers, name: f"Bearer {self.key}" if name == "authorization" else self.key}
 
 
-METERED: dict[Protocol, tuple[str, ...]] = {
-    "openai": ("chat/completions", "responses"),
-    "anthropic": ("messages",),
-}
-"""Paths of requests that cost tokens, after `v1/`."""
-FREE: dict[Protocol, tuple[str, ...]] = {
-    "openai": ("models",),
-    "anthropic": ("models", "messages/count_tokens"),
-}
-"""Paths of requests that cost nothing; they pass on uncounted."""
-
-
-_CLIENTS_TOOLS = re.compile(
-    r"function|custom|namespace|tool_search|(local_)?shell|apply_patch|(computer|bash|text_editor|memory)(_.*)?"
-)
-"""Types of tools that the agent runs itself, in OpenAI's and Anthropic's requests."""
-
-_HOSTED = ("mcp_servers", "plugins", "prompt", "web_search_options")
-"""Other fields of a request that let the provider run tools; a stored `prompt` may have some."""
-
-
-def hosted_tools(request: Mapping[str, Any]) -> list[str]:
-    """The kinds of tools in a request that the provider runs, such as `web_search`, without the version of
-    Anthropic's; a kind that is not known counts as one of these."""
-    tools = request.get("tools")
-    kinds = [
-        str(tool.get("type") or "custom")
-        for tool in (tools if isinstance(tools, list) else ())
-        if isinstance(tool, dict)
-    ]
-    kinds += [name for name in _HOSTED if request.get(name)]
-    return sorted({re.sub(r"_\d{8}$", "", kind) for kind in kinds if not _CLIENTS_TOOLS.fullmatch(kind)})
-
-
+KEY_HEADERS = ("x-api-key", "api-key", "x-goog-api-key")
+"""Headers besides `authorization` in which an agent may send its token."""
 _PASSED_UP = ("content-type", "accept", "user-agent", "openai-beta", "session_id", "originator", "version")
-_PASSED_UP_FROM = ("anthropic-", "x-stainless-", "x-codex-")
+_PASSED_UP_FROM = ("anthropic-", "x-stainless-", "x-codex-", "x-goog-api-client")
 _PASSED_DOWN = (
     "content-type",
     "retry-after",
@@ -117,26 +131,31 @@ class Refusal(NamedTuple):
     """`type` and `code`."""
     anthropic: str
     """`type`."""
+    google: str
+    """`status`."""
 
     def body(self, protocol: Protocol, message: str) -> bytes:
-        error: dict[str, Any]
-        if protocol == "openai":
-            kind, code = self.openai
-            error = {"error": {"message": message, "type": kind, "param": None, "code": code}}
-        else:
-            error = {"type": "error", "error": {"type": self.anthropic, "message": message}}
-        return json.dumps(error).encode()
+        kind, code = self.openai
+        errors: dict[Protocol, Any] = {
+            "openai": {"error": {"message": message, "type": kind, "param": None, "code": code}},
+            "anthropic": {"type": "error", "error": {"type": self.anthropic, "message": message}},
+            "google": {"error": {"code": self.status, "message": message, "status": self.google}},
+        }
+        return json.dumps(errors[protocol]).encode()
 
 
-_INVALID = ("invalid_request_error", "invalid_request")
-SPENT = Refusal(400, ("billing_limit_user_error", "billing_hard_limit_reached"), "invalid_request_error")
+_WRONG = "invalid_request_error"
+_INVALID = (_WRONG, "invalid_request")
+SPENT = Refusal(
+    400, ("billing_limit_user_error", "billing_hard_limit_reached"), _WRONG, "FAILED_PRECONDITION"
+)
 """As OpenAI and Anthropic refuse an account without money: clients do not try again."""
-NO_TOKEN = Refusal(401, ("invalid_request_error", "invalid_api_key"), "authentication_error")
-OTHER_MODEL = Refusal(404, ("invalid_request_error", "model_not_found"), "not_found_error")
-NO_PATH = Refusal(404, ("invalid_request_error", "unknown_url"), "not_found_error")
-INVALID = Refusal(400, _INVALID, "invalid_request_error")
-TOO_SLOW = Refusal(408, _INVALID, "invalid_request_error")
-TOO_LARGE = Refusal(413, _INVALID, "request_too_large")
-COMPRESSED = Refusal(415, _INVALID, "invalid_request_error")
-TOO_MANY = Refusal(429, ("requests", "rate_limit_exceeded"), "rate_limit_error")
-UNREACHABLE = Refusal(502, ("server_error", "server_error"), "api_error")
+NO_TOKEN = Refusal(401, (_WRONG, "invalid_api_key"), "authentication_error", "UNAUTHENTICATED")
+OTHER_MODEL = Refusal(404, (_WRONG, "model_not_found"), "not_found_error", "NOT_FOUND")
+NO_PATH = Refusal(404, (_WRONG, "unknown_url"), "not_found_error", "NOT_FOUND")
+INVALID = Refusal(400, _INVALID, _WRONG, "INVALID_ARGUMENT")
+TOO_SLOW = Refusal(408, _INVALID, _WRONG, "DEADLINE_EXCEEDED")
+TOO_LARGE = Refusal(413, _INVALID, "request_too_large", "INVALID_ARGUMENT")
+COMPRESSED = Refusal(415, _INVALID, _WRONG, "INVALID_ARGUMENT")
+TOO_MANY = Refusal(429, ("requests", "rate_limit_exceeded"), "rate_limit_error", "RESOURCE_EXHAUSTED")
+UNREACHABLE = Refusal(502, ("server_error", "server_error"), "api_error", "UNAVAILABLE")

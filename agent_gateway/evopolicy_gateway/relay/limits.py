@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Annotated, Any
 
 import msgspec
@@ -54,6 +55,8 @@ class Request(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
     """The model that the answer names."""
     hosted_tools: tuple[str, ...] = ()
     """Kinds of tools in the request that the provider runs."""
+    tier: str = ""
+    """Service tier by whose prices it is charged; empty: the usual one."""
     status: int
     """HTTP status; 0 where no answer came."""
     broken: bool = False
@@ -65,6 +68,18 @@ class Request(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
     whole_s: float = 0.0
     wait_s: float = 0.0
     """Time that the provider told the agent to wait, seconds."""
+
+
+class Reserve(msgspec.Struct, frozen=True, kw_only=True):
+    """Most that a request in flight may use: its estimated input, uncached, and its most output."""
+
+    usage: Usage
+    tier: str = ""
+
+    def cost(self, prices: Prices) -> float:
+        """Most US dollars."""
+        dearest = msgspec.structs.replace(prices, input=max(prices.input, prices.cache_creation))
+        return self.usage.cost(dearest) * prices.tiers.get(self.tier, 1.0)
 
 
 class Used(msgspec.Struct, kw_only=True):
@@ -82,6 +97,8 @@ class Used(msgspec.Struct, kw_only=True):
     """Requests by model that was asked for and is not the declared one."""
     hosted_tools: dict[str, int] = {}
     """Requests by kind of tool that the provider runs."""
+    tiers: dict[str, Usage] = {}
+    """The part of the usage that is charged by the prices of a service tier."""
     first_s: float = 0.0
     """Sum over the answered requests, seconds."""
     wait_s: float = 0.0
@@ -98,26 +115,44 @@ class Used(msgspec.Struct, kw_only=True):
             _count(self.models, request.answered)
         for kind in request.hosted_tools:
             _count(self.hosted_tools, kind)
-        if declared and request.asked != declared:
+        if request.tier and (request.tier in self.tiers or len(self.tiers) < _MAX_NAMES):
+            self.tiers[request.tier] = self.tiers.get(request.tier, Usage()) + request.usage
+        if declared and request.asked not in (declared, ""):
             _count(self.other_models, request.asked)
 
-    def over(self, limits: Limits, prices: Prices | None, in_flight: int = 0) -> str:
-        """Which limit is used up; empty for none. `in_flight`: requests without a line yet."""
-        if self.requests + in_flight >= limits.max_requests:
+    def cost(self, prices: Prices) -> float:
+        """Cost in US dollars."""
+        more = (each.cost(prices) * (prices.tiers.get(tier, 1.0) - 1.0) for tier, each in self.tiers.items())
+        return self.usage.cost(prices) + sum(more)
+
+    def over(
+        self,
+        limits: Limits,
+        prices: Prices | None,
+        others: Iterable[Reserve] = (),
+        own: Reserve | None = None,
+    ) -> str:
+        """Which limit is used up; empty for none. `others`: of the requests in flight; `own`: of one that is to be
+        sent beside them, or that may use more than one answer's tokens."""
+        reserved = [*others]
+        n, reserved = len(reserved), reserved + ([own] if own else [])
+        if self.requests + n >= limits.max_requests:
             return f"{limits.max_requests:,} requests"
-        if self.usage.total >= limits.max_tokens:
+        if self.usage.total + sum(each.usage.total for each in reserved) >= limits.max_tokens:
             return f"{limits.max_tokens:,} tokens"
-        if limits.max_cost is not None and prices and self.usage.cost(prices) >= limits.max_cost:
-            return f"{limits.max_cost:,.2f} dollars"
+        if limits.max_cost is not None and prices is not None:
+            cost = self.cost(prices) + sum(each.cost(prices) for each in reserved)
+            return f"{limits.max_cost:,.2f} dollars" if cost >= limits.max_cost else ""
         return ""
 
     def recorded(self, prices: Prices | None) -> dict[str, Any]:
-        """The form of `run.json`'s `tokens`, with the number of requests."""
-        return self.usage.recorded(prices) | {"requests": self.requests}
+        """The form of `run.json`'s `tokens`."""
+        cost = {} if prices is None else {"cost": round(self.cost(prices), 6)}
+        return self.usage.recorded(None) | cost
 
     def words(self, prices: Prices | None) -> str:
         """One line for people."""
-        cost = "" if prices is None else f", {self.usage.cost(prices):,.2f} dollars"
+        cost = "" if prices is None else f", {self.cost(prices):,.2f} dollars"
         failed = f" ({self.failed:,} failed)" if self.failed else ""
         return f"{self.requests:,} requests{failed}, {self.usage.total:,} tokens{cost} so far"
 

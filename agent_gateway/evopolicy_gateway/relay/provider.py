@@ -25,9 +25,25 @@ FAILED = (
     httpcore.UnsupportedProtocol,
 )
 """Errors of a request or its answer."""
+NOT_SENT = (
+    *(httpcore.ConnectError, httpcore.ConnectTimeout, httpcore.PoolTimeout),
+    *(httpcore.ProxyError, httpcore.UnsupportedProtocol),
+)
+"""Those of a request that did not reach the provider."""
 _CONNECT_S = 30.0
 _KEEP_ALIVE_S = 60.0
-_HERE = ("localhost", "127.0.0.1")
+_HERE = ("localhost", "127.0.0.1", "::1")
+
+
+class Sent(NamedTuple):
+    """A request to the provider."""
+
+    name: str
+    """`apis.Route.name`."""
+    method: str
+    url: str
+    headers: Mapping[str, str]
+    body: bytes
 
 
 class Answer(NamedTuple):
@@ -71,13 +87,11 @@ class Provider:
         await self._pool.aclose()
 
     @contextlib.asynccontextmanager
-    async def sent(
-        self, method: str, url: str, headers: Mapping[str, str], body: bytes
-    ) -> AsyncIterator[Answer]:
+    async def sent(self, sent: Sent) -> AsyncIterator[Answer]:
         """Sends a request; raises `FAILED`. The answer ends with the `with`."""
-        wanted = [(name.encode(), _encoded(value)) for name, value in {**self._usual, **headers}.items()]
+        wanted = [(name.encode(), _encoded(value)) for name, value in {**self._usual, **sent.headers}.items()]
         async with self._pool.stream(
-            method, url, headers=wanted, content=body, extensions=self._extensions
+            sent.method, sent.url, headers=wanted, content=sent.body, extensions=self._extensions
         ) as response:
             names = [(name.decode("latin-1").lower(), value) for name, value in response.headers]
             headers = {name: value.decode("latin-1") for name, value in names}

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import itertools
-from collections.abc import AsyncIterator, Callable, Iterator, Mapping
+from collections.abc import AsyncIterator, Callable, Iterator
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -20,9 +20,9 @@ from evopolicy_common.records.model_record import Call, Kept, Level, Pack, key_o
 from evopolicy_common.records.secrets import Redaction
 from evopolicy_gateway.relay import apis
 from evopolicy_gateway.relay.canonical import canonical
-from evopolicy_gateway.relay.provider import Answer
+from evopolicy_gateway.relay.provider import Answer, Sent
 
-_MAX_ANSWER_BYTES = 8 << 20
+MAX_ANSWER_BYTES = 8 << 20
 """Limit of an answer whose content is kept."""
 _MAX_HEADERS, _MAX_HEADER = 30, 200
 
@@ -30,9 +30,7 @@ _MAX_HEADERS, _MAX_HEADER = 30, 200
 class Source(Protocol):
     """Where answers come from."""
 
-    def sent(
-        self, method: str, url: str, headers: Mapping[str, str], body: bytes
-    ) -> contextlib.AbstractAsyncContextManager[Answer]: ...
+    def sent(self, sent: Sent) -> contextlib.AbstractAsyncContextManager[Answer]: ...
 
     async def close(self) -> None: ...
 
@@ -59,7 +57,7 @@ class Cleaning:
 
 
 class Recorder:
-    """A provider whose calls are recorded. `url` and what is sent stay as they are."""
+    """A provider whose calls are recorded."""
 
     def __init__(
         self,
@@ -67,11 +65,9 @@ class Recorder:
         folder: Path,
         level: Level,
         clean: Cleaning,
-        base_url: str,
         note: Callable[[str], None],
     ) -> None:
         self._source, self._clean, self._note = source, clean, note
-        self._base = base_url
         self._stopped = folder / model_record.STOPPED
         self._on = not self._stopped.exists()
         self._n = self._begun = 0
@@ -96,20 +92,17 @@ class Recorder:
             self._pack = self._opened.enter_context(contextlib.closing(Pack(folder, writes=True)))
 
     @contextlib.asynccontextmanager
-    async def sent(
-        self, method: str, url: str, headers: Mapping[str, str], body: bytes
-    ) -> AsyncIterator[Answer]:
+    async def sent(self, sent: Sent) -> AsyncIterator[Answer]:
         n, self._begun = self._begun, self._begun + 1
-        api = api_of(url, self._base)
         answer: _Heard | None = None
         try:
-            async with self._source.sent(method, url, headers, body) as got:
+            async with self._source.sent(sent) as got:
                 answer = _Heard(got)
                 yield got._replace(pieces=answer.pieces())
         finally:
             if self._on:
                 with self._stopping():
-                    self._keep(n, api, method, body, answer)
+                    self._keep(n, sent, answer)
 
     @contextlib.contextmanager
     def _stopping(self) -> Iterator[None]:
@@ -124,10 +117,10 @@ class Recorder:
                 why = str(error) if isinstance(error, ValueError) else getattr(error, "strerror", None)
                 self._stopped.write_text(f"{why or 'its files cannot be read'}\n")
 
-    def _keep(self, n: int, api: str, method: str, body: bytes, answer: _Heard | None) -> None:
+    def _keep(self, n: int, sent: Sent, answer: _Heard | None) -> None:
         if self._n >= model_record.MAX_CALLS:
             raise ValueError(f"its limit of {model_record.MAX_CALLS:,} calls is reached")
-        request = canonical(api, self._clean(body))
+        request = canonical(sent.name, self._clean(sent.body))
         call: dict[str, Any] = {"status": 0, "broken": True}
         if answer is not None:
             data = self._clean(bytes(answer.heard))
@@ -142,7 +135,7 @@ class Recorder:
                 self._pack.put(data)
         if self._pack is not None:
             call["request"] = _put_request(self._pack, request)
-        line = Call(n=n, api=api, method=method, digest=key_of(request), **call)
+        line = Call(n=n, api=sent.name, method=sent.method, digest=key_of(request), **call)
         self._calls.write(msgspec.json.encode(line) + b"\n")
         self._n += 1
 
@@ -159,18 +152,13 @@ class _Heard:
 
     async def pieces(self) -> AsyncIterator[bytes]:
         async for data in self.got.pieces:
-            if len(self.heard) + len(data) > _MAX_ANSWER_BYTES:
+            if len(self.heard) + len(data) > MAX_ANSWER_BYTES:
                 self.left_out = "it is too long"
                 self.heard.clear()
             if not self.left_out:
                 self.heard += data
             yield data
         self.ended = True
-
-
-def api_of(url: str, base_url: str) -> str:
-    """The API of a request's address, below the base URL and without its query."""
-    return url.removeprefix(base_url.rstrip("/")).partition("?")[0].strip("/").removeprefix("v1/")
 
 
 def document_of(request: bytes) -> dict[str, Any]:

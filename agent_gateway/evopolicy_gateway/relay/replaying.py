@@ -8,15 +8,15 @@ from __future__ import annotations
 
 import contextlib
 import json
-from collections.abc import AsyncIterator, Callable, Mapping
+from collections.abc import AsyncIterator, Callable
 from pathlib import Path
 
 import httpcore
 
 from evopolicy_common.records.model_record import Pack, key_of, read_calls, request_of
 from evopolicy_gateway.relay.canonical import canonical, difference
-from evopolicy_gateway.relay.provider import Answer
-from evopolicy_gateway.relay.recording import Cleaning, api_of, document_of
+from evopolicy_gateway.relay.provider import Answer, Sent
+from evopolicy_gateway.relay.recording import Cleaning, document_of
 
 DIFFERENCE = "difference.txt"
 _PIECE = 64 << 10
@@ -25,23 +25,19 @@ _PIECE = 64 << 10
 class Replayed:
     """The record of a run as a source of answers."""
 
-    def __init__(
-        self, folder: Path, clean: Cleaning, base_url: str, out: Path, differs: Callable[[str], None]
-    ) -> None:
+    def __init__(self, folder: Path, clean: Cleaning, out: Path, differs: Callable[[str], None]) -> None:
         """`out`: where `DIFFERENCE` is written. `differs` is called with the first line of it. Raises ConfigError."""
         self._left = read_calls(folder)
         self._pack = Pack(folder)
-        self._clean, self._base, self._out, self._differs = clean, base_url, out, differs
+        self._clean, self._out, self._differs = clean, out, differs
 
     async def close(self) -> None:
         self._pack.close()
 
     @contextlib.asynccontextmanager
-    async def sent(
-        self, method: str, url: str, headers: Mapping[str, str], body: bytes
-    ) -> AsyncIterator[Answer]:
-        api = api_of(url, self._base)
-        request = canonical(api, self._clean(body))
+    async def sent(self, sent: Sent) -> AsyncIterator[Answer]:
+        api = sent.name
+        request = canonical(api, self._clean(sent.body))
         digest = key_of(request)
         call = next((each for each in self._left if each.digest == digest and each.api == api), None)
         if call is None or call.left_out:

@@ -13,25 +13,31 @@ from email.utils import parsedate_to_datetime
 from pathlib import Path
 from typing import Any
 
+import httpcore
 import msgspec
-import orjson
 from starlette.requests import ClientDisconnect, Request
 from starlette.responses import Response, StreamingResponse
 from starlette.types import Receive, Scope, Send
 
 from evopolicy_common.records.model_record import Level
-from evopolicy_gateway.relay import apis, limits
-from evopolicy_gateway.relay.answers import SHAPES, AnswerReader, Cleaner
-from evopolicy_gateway.relay.apis import Refusal, Upstream
+from evopolicy_common.records.secrets import Redaction
+from evopolicy_gateway.relay import apis, limits, requests
+from evopolicy_gateway.relay.answers import FREE, SHAPES, AnswerReader
+from evopolicy_gateway.relay.apis import Refusal, Route, Upstream
 from evopolicy_gateway.relay.ledger import Ledger
-from evopolicy_gateway.relay.provider import FAILED, Answer, Provider
+from evopolicy_gateway.relay.provider import FAILED, NOT_SENT, Answer, Provider, Sent
+from evopolicy_gateway.relay.recording import MAX_ANSWER_BYTES as MAX_RECORDED_BYTES
 from evopolicy_gateway.relay.recording import Cleaning, Recorder, Source
 from evopolicy_gateway.relay.replaying import Replayed
+from evopolicy_gateway.relay.requests import Facts
+from evopolicy_gateway.relay.usage import Usage
 
 MAX_REQUEST_BYTES = 32 << 20
-MAX_ERROR_BYTES = 1 << 20
+MAX_HELD_BYTES = 128 << 20
+"""Of all requests and answers together that the relay holds, whole or not."""
 MAX_ANSWER_BYTES = 256 << 20
 """Of one answer, uncompressed."""
+MAX_ERROR_BYTES = 1 << 20
 MAX_IN_FLIGHT = 32
 REQUEST_WAIT_S = 60.0
 """Time in which a request's body has to arrive."""
@@ -39,8 +45,12 @@ MAX_RETRY_S = 60.0
 """Longest wait that clients keep within a request; with a longer one their turn fails, and the harness waits."""
 _FIRST_RETRY_S = 1.0
 _CHUNK = 64 << 10
-_SHOWN = 200
-_MAX_TOOLS = 20
+_SHOWN, _MAX_WORDS = 200, 2000
+_FINAL = {"x-should-retry": "false"}
+_NO_QUOTA = b"insufficient_quota"
+_ADDED = (b"stream_options", b"include_usage")
+"""Names of what the relay adds to a request."""
+_BROKEN = (*FAILED, ValueError, zlib.error, MemoryError)
 
 
 class Order(limits.ModelTerms, frozen=True, kw_only=True):
@@ -63,6 +73,18 @@ class Order(limits.ModelTerms, frozen=True, kw_only=True):
     """Other texts that the record leaves out."""
 
 
+class _RefusedError(Exception):
+    """The relay answers a request itself. Without headers the answer is final."""
+
+    def __init__(self, refusal: Refusal, message: str, headers: Mapping[str, str] = _FINAL) -> None:
+        super().__init__(message)
+        self.refusal, self.headers = refusal, headers
+
+
+def _busy(message: str) -> _RefusedError:
+    return _RefusedError(apis.TOO_MANY, message, {"retry-after": "1"})
+
+
 class Relay:
     """The ASGI application."""
 
@@ -77,169 +99,175 @@ class Relay:
     ) -> None:
         """`counted` is called after each request, `note` with a line for the operator, `spent` with the
         limit that is used up. `now`: Unix time, seconds."""
-        self._order = order
+        self.order = order
         self.upstream = order.upstream
         self._ledger = Ledger(Path(order.ledger), order.model)
         self.used = self._ledger.used
         self._counted, self._note, self._spent = counted, note, spent
         self.now = now
-        self.in_flight = 0
+        self.open: set[_Exchange] = set()
+        self.adds_counts = True
+        """Whether streams are asked for counts; not after a provider refused that."""
+        self._least = Usage()
+        """The usage of the largest answer that was above its reserve."""
         self.troubles = 0
         """Failed requests since the last answered one."""
         self._told: set[str] = set()
         keys = order.upstream.key, *order.upstream.headers.values()
-        self.secrets = tuple(value.encode() for value in keys if len(value) >= 8)
-        base_url = order.upstream.base_url
+        self.clean = Redaction(keys).known
         clean, folder = Cleaning(order.tokens, (*order.secrets, *keys)), Path(order.folder)
-        self._provider: Source
+        self.provider: Source
         if order.replay:
-            self._provider = Replayed(Path(order.replay), clean, base_url, folder, spent)
+            self.provider = Replayed(Path(order.replay), clean, folder, spent)
         else:
-            self._provider = Provider(base_url, order.timeout_s)
+            self.provider = Provider(order.upstream.base_url, order.timeout_s)
         if order.record != "off":
-            self._provider = Recorder(self._provider, folder, order.record, clean, base_url, note)
-        self._authorization = order.upstream.authorization()
+            self.provider = Recorder(self.provider, folder, order.record, clean, note)
 
-    async def close(self) -> None:
-        await self._provider.close()
+    async def close(self, grace_s: float = 0.0) -> None:
+        """Ends the answers that are still coming after `grace_s`; they are counted as broken off."""
+        if tasks := [each.task for each in self.open if each.task is not None]:
+            await asyncio.wait(tasks, timeout=grace_s)
+            for task in tasks:
+                task.cancel()
+            await asyncio.wait(tasks)
+        await self.provider.close()
         self._ledger.close()
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] != "http":
             return
-        request = Request(scope, receive)
-        with contextlib.suppress(ClientDisconnect):
-            response = await self._answer(request)
+        exchange = _Exchange(self)
+        try:
+            response = await self._answer(exchange, Request(scope, receive))
             await response(scope, receive, send)
-
-    async def _answer(self, request: Request) -> Response:
-        if not self._is_agents(request.headers):
-            why = "the relay does not know this key; use the one of your environment"
-            return self.refused(apis.NO_TOKEN, why)
-        if "transfer-encoding" in request.headers and "content-length" in request.headers:
-            return self.refused(apis.INVALID, "the request has two lengths", more={"connection": "close"})
-        protocol = self.upstream.protocol
-        api = request.url.path.strip("/").removeprefix("v1/")
-        path = f"v1/{api}" if protocol == "anthropic" else api
-        if api not in apis.METERED[protocol] + apis.FREE[protocol]:
-            served = ", ".join(apis.METERED[protocol])
-            return self.refused(apis.NO_PATH, f"{request.url.path[:_SHOWN]} is not served: only {served}")
-        if request.headers.get("content-encoding", "identity").lower() != "identity":
-            return self.refused(apis.COMPRESSED, "send the request uncompressed")
-        body = b""
-        if request.method == "POST":
-            try:
-                async with asyncio.timeout(REQUEST_WAIT_S):
-                    body = await _whole(request.stream(), "request", MAX_REQUEST_BYTES)
-            except TimeoutError:
-                return self.refused(apis.TOO_SLOW, f"the request did not arrive within {REQUEST_WAIT_S:g} s")
-            except ValueError as error:
-                return self.refused(apis.TOO_LARGE, str(error))
-        elif request.method != "GET" or api in SHAPES:
-            return self.refused(apis.NO_PATH, f"{request.method} is not served here")
-        if api not in SHAPES:
-            return await self._free(request, path, body)
-        return await self._metered(request, api, path, body)
-
-    async def _free(self, request: Request, path: str, body: bytes) -> Response:
-        """Passes on a request that costs nothing."""
-        try:
-            async with self.sent(request, path, body) as answer:
-                data = await _whole(_unpacked(answer), "answer", MAX_ERROR_BYTES)
-        except (*FAILED, ValueError, zlib.error) as error:
-            return self.refused(apis.UNREACHABLE, self.unreachable(error))
-        return Response(self.clean(data), answer.status, self.headers_of(answer))
-
-    async def _metered(self, request: Request, api: str, path: str, body: bytes) -> Response:
-        order, used = self._order, self.used
-        try:
-            document = orjson.loads(body)
-        except orjson.JSONDecodeError as error:
-            return self.refused(apis.INVALID, f"the request is not JSON: {error}")
-        if not isinstance(document, dict):
-            return self.refused(apis.INVALID, "the request is not a JSON object")
-        if document.get("background"):
-            # It would go on after its answer, uncounted.
-            return self.refused(apis.INVALID, "requests in the background are not served")
-        asked = str(document.get("model", ""))[:_SHOWN]
-        if order.model and asked != order.model:
-            if order.declared_only:
-                why = f"the run's model is {order.model}; {asked!r} is not allowed"
-                return self.refused(apis.OTHER_MODEL, why)
-            self._once(f"the agent asks for the model {asked!r} besides {order.model}")
-        if hosted := tuple(kind[:_SHOWN] for kind in apis.hosted_tools(document)[:_MAX_TOOLS]):
-            if order.own_tools_only:
-                return self.refused(apis.INVALID, f"tools of the provider are refused: {', '.join(hosted)}")
-            self._once(f"the agent offers its model tools of the provider: {', '.join(hosted)}")
-        if what := used.over(order.limits, order.prices, self.in_flight):
-            if not used.over(order.limits, order.prices):
-                why = "the last requests of the model budget are under way"
-                return self.refused(apis.TOO_MANY, why, retry_after="1")
-            self._spent(what)
-            return self.refused(apis.SPENT, f"the run's model budget is spent: {what}")
-        if self.in_flight >= MAX_IN_FLIGHT:
-            return self.refused(apis.TOO_MANY, f"{MAX_IN_FLIGHT} requests are under way", retry_after="1")
-        if order.declared_only or order.own_tools_only:
-            # A name that occurs twice is read in one way here, and perhaps in another there.
-            body = orjson.dumps(document)
-        options = document.get("stream_options")
-        options = options if isinstance(options, dict) else {}
-        streams = api == "chat/completions" and document.get("stream") is True
-        if drops_usage := streams and options.get("include_usage") is not True:
-            body = orjson.dumps(document | {"stream_options": options | {"include_usage": True}})
-        line = limits.Request(at=round(self.now(), 3), api=api, asked=asked, hosted_tools=hosted, status=0)
-        exchange = _Exchange(self, line, body, drops_usage=drops_usage)
-        response = None
-        try:
-            response = await exchange.answer(request, path)
+        except ClientDisconnect:
+            pass
         finally:
-            if not isinstance(response, _Streamed):
-                await exchange.close()
-        return response
+            exchange.agent_left()
+
+    async def _answer(self, exchange: _Exchange, request: Request) -> Response:
+        try:
+            route = self._route(request)
+            if len(self.open) >= MAX_IN_FLIGHT:
+                raise _busy(f"{MAX_IN_FLIGHT} requests are under way")
+            self.open.add(exchange)
+            facts = await self._facts(exchange, request, route)
+            self._admit(exchange, route, facts)
+            return await exchange.begin(request, route, facts)
+        except _RefusedError as why:
+            return self.refusal(why)
+        except MemoryError:
+            return self.refusal(_busy("the relay has no memory for this request"))
+
+    def _route(self, request: Request) -> Route:
+        headers, path = request.headers, request.scope["path"]
+        if not self._is_agents(headers):
+            raise _RefusedError(
+                apis.NO_TOKEN, "the relay does not know this key; use the one of your environment"
+            )
+        if "transfer-encoding" in headers and "content-length" in headers:
+            raise _RefusedError(apis.INVALID, "the request has two lengths", {"connection": "close"})
+        route = self.upstream.route(path)
+        if route is None:
+            raise _RefusedError(
+                apis.NO_PATH, f"{path[:_SHOWN]} is not served for {self.upstream.protocol}'s APIs"
+            )
+        if request.method != ("POST" if route.api in requests.RULES else "GET"):
+            raise _RefusedError(apis.NO_PATH, f"{request.method} is not served here")
+        if headers.get("content-encoding", "identity").lower() != "identity":
+            raise _RefusedError(apis.COMPRESSED, "send the request uncompressed")
+        return route
+
+    async def _facts(self, exchange: _Exchange, request: Request, route: Route) -> Facts:
+        """What the request asks for. Raises _RefusedError."""
+        if request.method == "GET":
+            return Facts()
+        try:
+            async with asyncio.timeout(REQUEST_WAIT_S):
+                body = await exchange.whole(request.stream(), "request", MAX_REQUEST_BYTES)
+        except TimeoutError:
+            raise _RefusedError(
+                apis.TOO_SLOW, f"the request did not arrive within {REQUEST_WAIT_S:g} s"
+            ) from None
+        except ValueError as error:
+            raise _RefusedError(apis.TOO_LARGE, str(error)) from None
+        try:
+            return requests.facts(route.api, body, route.model)
+        except ValueError as error:
+            raise _RefusedError(apis.INVALID, f"the request cannot be read: {error}") from None
+
+    def _admit(self, exchange: _Exchange, route: Route, facts: Facts) -> None:
+        """Raises _RefusedError for a request that the run's terms or limits do not allow."""
+        order, used = self.order, self.used
+        if facts.body:
+            self._check(facts)
+        exchange.hold(len(facts.body) + len(facts.with_counts or b""))
+        if what := used.over(order.limits, order.prices):
+            self._spent(what)
+            raise _RefusedError(apis.SPENT, f"the run's model budget is spent: {what}")
+        least, usage = self._least, Usage()
+        if not route.free:
+            fresh = max(facts.input, least.total - least.output)
+            usage = Usage(input_noncached=fresh, output=max(facts.output, least.output))
+        own = limits.Reserve(usage=usage, tier=facts.tier)
+        others = [each.reserve for each in self.open if each.task is not None]
+        if others or facts.n_answers > 1:
+            what = used.over(order.limits, order.prices, others, own)
+            if what and not others:
+                raise _RefusedError(apis.INVALID, f"{facts.n_answers} answers may exceed the limit of {what}")
+            if what:
+                raise _busy(f"with the requests under way this one may exceed the limit of {what}")
+        exchange.reserve = own
+
+    def _check(self, facts: Facts) -> None:
+        """Raises _RefusedError for a request that the run's terms do not allow."""
+        order = self.order
+        if facts.background:
+            # It would go on after its answer, uncounted.
+            raise _RefusedError(apis.INVALID, "requests in the background are not served")
+        if order.model and facts.asked != order.model:
+            if order.declared_only:
+                why = f"the run's model is {order.model}; {facts.asked!r} is not allowed"
+                raise _RefusedError(apis.OTHER_MODEL, why)
+            self.once(f"the agent asks for the model {facts.asked!r} besides {order.model}")
+        if facts.hosted:
+            kinds = ", ".join(facts.hosted)
+            if order.own_tools_only:
+                raise _RefusedError(apis.INVALID, f"tools of the provider are refused: {kinds}")
+            self.once(f"the agent offers its model tools of the provider: {kinds}")
+        if facts.unknown and (order.declared_only or order.own_tools_only):
+            which = 'hosted_tools = "refuse"' if order.own_tools_only else 'models = "declared"'
+            raise _RefusedError(
+                apis.INVALID, f"{facts.unknown} is not among the fields that a run with {which} may use"
+            )
+        limited = order.prices if order.limits.max_cost is not None else None
+        if facts.tier and limited is not None and facts.tier not in limited.tiers:
+            why = f"the service tier {facts.tier!r} has no price, and the run's cost is limited"
+            raise _RefusedError(apis.INVALID, f"{why}: add it to prices.tiers")
 
     def _is_agents(self, headers: Mapping[str, str]) -> bool:
         given = [headers.get("authorization", "").partition(" ")[2]]
-        given += [headers.get(name, "") for name in ("x-api-key", "api-key")]
-        return any(hmac.compare_digest(each.encode(), self._order.token.encode()) for each in given)
+        given += [headers.get(name, "") for name in apis.KEY_HEADERS]
+        return any(hmac.compare_digest(each.encode(), self.order.token.encode()) for each in given)
 
-    def sent(
-        self, request: Request, path: str, body: bytes
-    ) -> contextlib.AbstractAsyncContextManager[Answer]:
-        """The request to the provider, built anew."""
-        headers = apis.passed_up(request.headers) | self._authorization
-        url = self.upstream.url(path, request.query_params)
-        return self._provider.sent(request.method, url, headers, body)
+    def refusal(self, why: _RefusedError) -> Response:
+        headers = {**why.headers, "content-type": "application/json"}
+        body = why.refusal.body(self.upstream.protocol, str(why))
+        return Response(self.clean(body), why.refusal.status, headers)
 
-    def refused(
-        self, refusal: Refusal, message: str, *, retry_after: str = "", more: Mapping[str, str] = {}
-    ) -> Response:
-        """An answer of the relay's own. Without `retry_after` or headers in `more`, it is final."""
-        headers = {"retry-after": retry_after} if retry_after else dict(more) or {"x-should-retry": "false"}
-        headers["content-type"] = "application/json"
-        return Response(refusal.body(self.upstream.protocol, message), refusal.status, headers)
-
-    def count(self, request: limits.Request) -> None:
+    def count(self, line: limits.Request, reserve: limits.Reserve) -> None:
         """Writes a finished request to the ledger. Raises OSError when the disk refuses."""
-        self.in_flight -= 1
-        self._ledger.write(request)
+        if line.usage.total > max(reserve.usage.total, self._least.total):
+            self._least = line.usage
+        self._ledger.write(line)
         self._counted()
 
     def headers_of(self, answer: Answer) -> dict[str, str]:
-        return {
-            name: self.clean(value.encode()).decode("latin-1")
-            for name, value in apis.passed_down(answer.headers).items()
-        }
+        passed = apis.passed_down(answer.headers).items()
+        return {name: self.clean(value.encode()).decode("latin-1") for name, value in passed}
 
-    def clean(self, data: bytes) -> bytes:
-        """The bytes without the key, which some servers repeat in their errors."""
-        cleaner = Cleaner(self.secrets)
-        return cleaner.feed(data) + cleaner.end()
-
-    def unreachable(self, error: Exception) -> str:
-        text = f"base_url {self.upstream.shown} gives no answer: {str(error) or type(error).__name__}"
-        return self.clean(text.encode()).decode("utf-8", "replace")
-
-    def _once(self, text: str) -> None:
+    def once(self, text: str) -> None:
         if text not in self._told and len(self._told) < 20:
             self._told.add(text)
             self._note(text)
@@ -256,144 +284,179 @@ class Relay:
 
 
 class _Exchange:
-    """One request that costs tokens, and its answer. Call `close` at the end of both."""
+    """A request of the agent and its answer. The provider's answer is read in a task of its own, to its end: an agent
+    that leaves does not change what is counted."""
 
-    def __init__(self, relay: Relay, line: limits.Request, body: bytes, *, drops_usage: bool) -> None:
-        """`line`: of the ledger, as far as it is known now."""
-        self._relay, self._line = relay, line
-        self._body, self._drops_usage = body, drops_usage
+    def __init__(self, relay: Relay) -> None:
+        self.reserve = limits.Reserve(usage=Usage())
+        """Most that it may use, once it is sent."""
+        self.task: asyncio.Task[None] | None = None
+        self._relay = relay
+        self._held = self._recorded = 0
+        self._left = self._written = self._refused = False
         self._begun = time.monotonic()
         self._first_s: float | None = None
-        self._written = False
-        self._status = 0
         self._reader: AnswerReader | None = None
-        self._opened = contextlib.AsyncExitStack()
-        relay.in_flight += 1
+        self._head: asyncio.Future[Response] = asyncio.get_running_loop().create_future()
+        self._pieces: asyncio.Queue[bytes | Exception | None] = asyncio.Queue(1)
 
-    async def answer(self, request: Request, path: str) -> Response:
+    def hold(self, n_bytes: int) -> None:
+        """Tells how many bytes it holds. Raises _RefusedError when the relay holds too many."""
+        self._held = n_bytes
+        if sum(each._held + each._recorded for each in self._relay.open) > MAX_HELD_BYTES:
+            raise _busy("the relay holds too many bytes of requests and answers; wait until one is done")
+
+    async def whole(self, pieces: AsyncIterator[bytes], what: str, limit: int) -> bytes:
+        """All pieces together. Raises ValueError when they are longer."""
+        data, before = bytearray(), self._held
+        async for piece in pieces:
+            data += piece
+            if len(data) > limit:
+                raise ValueError(f"the {what} has more than {limit:,} bytes")
+            self.hold(before + len(data))
+        return bytes(data)
+
+    async def begin(self, request: Request, route: Route, facts: Facts) -> Response:
+        """Sends the request, and returns the answer, whose bytes are still to come."""
         relay = self._relay
-        try:
-            async with _while_there(request.receive):
-                got = await self._opened.enter_async_context(relay.sent(request, path, self._body))
-        except FAILED as error:
-            wait_s = relay.trouble("gives no answer", None)
-            self._write(wait_s=wait_s)
-            return relay.refused(apis.UNREACHABLE, relay.unreachable(error), retry_after=f"{wait_s:.0f}")
-        self._status = got.status
-        kind = got.headers.get("content-type", "").partition(";")[0].strip().lower()
-        events = kind == "text/event-stream"
-        if 200 <= got.status < 300 and (events or kind.endswith("json")):
-            relay.troubles = 0
-            self._reader = AnswerReader(SHAPES[self._line.api], events=events, drops_usage=self._drops_usage)
-            return _Streamed(self, self._passed(got, self._reader), got.status, relay.headers_of(got))
-        try:
-            data = await _whole(_unpacked(got), "answer", MAX_ERROR_BYTES)
-        except (*FAILED, ValueError, zlib.error):
-            data = b""
-        return self._failed(got, kind, data)
+        headers = apis.passed_up(request.headers) | relay.upstream.authorization()
+        url = relay.upstream.url(route.path, request.query_params)
+        counts = facts.with_counts if relay.adds_counts else None
+        bodies = [facts.body] if counts is None else [counts, facts.body]
+        self._facts, self._route, self._base = facts, route, sum(map(len, bodies))
+        self._line = limits.Request(
+            at=round(relay.now(), 3), api=route.api, asked=facts.asked, hosted_tools=facts.hosted, status=0
+        )
+        sent = [Sent(route.name, request.method, url, headers, body) for body in bodies]
+        self.task = asyncio.create_task(self._run(sent))
+        return await asyncio.shield(self._head)
 
-    async def close(self) -> None:
-        """Counts an answer that broke off, and ends the provider's."""
-        self._write(broken=True)
-        await self._opened.aclose()
+    def agent_left(self) -> None:
+        """The agent has its answer, or is gone: what still comes is only counted."""
+        self._left = True
+        while not self._pieces.empty():
+            self._pieces.get_nowait()
+        if self.task is None:
+            self._relay.open.discard(self)
+
+    async def _run(self, tries: list[Sent]) -> None:
+        """Sends the first of `tries`, and the next one where the provider refuses what the relay has added."""
+        relay, error = self._relay, None
+        try:
+            while not await self._sent(tries.pop(0), is_last=not tries):
+                pass
+        except (*_BROKEN, _RefusedError, OSError) as caught:
+            error = caught
+        finally:
+            fails = error is not None and not self._head.done()
+            wait_s = relay.trouble("gives no answer", None) if fails else 0.0
+            with contextlib.suppress(OSError):
+                self._write(error, broken=True, wait_s=wait_s)
+            relay.open.discard(self)
+            if not self._head.done():
+                why = f"base_url {relay.upstream.shown} gives no answer: {str(error) or type(error).__name__}"
+                retry = {"retry-after": f"{wait_s:.0f}"}
+                self._head.set_result(relay.refusal(_RefusedError(apis.UNREACHABLE, why, retry)))
+        await self._put(error)
+
+    async def _sent(self, sent: Sent, *, is_last: bool) -> bool:
+        """Sends a request and reads its answer. Returns False where the next try should be sent."""
+        relay = self._relay
+        async with relay.provider.sent(sent) as got:
+            self._line = msgspec.structs.replace(self._line, status=got.status)
+            kind = got.headers.get("content-type", "").partition(";")[0].strip().lower()
+            events = kind == "text/event-stream"
+            if 200 <= got.status < 300 and (events or kind.endswith("json")):
+                relay.troubles = 0
+                # Only a provider that takes the same request without the addition has refused the addition.
+                relay.adds_counts &= not self._refused
+                await self._pass(got, events=events, drops_usage=not is_last)
+                return True
+            data = b""
+            with contextlib.suppress(*_BROKEN, _RefusedError):
+                data = await self.whole(_unpacked(got), "answer", MAX_ERROR_BYTES)
+            if not is_last and got.status in (400, 422) and any(each in data for each in _ADDED):
+                self._refused = True
+                relay.count(self._line, self.reserve)
+                return False
+            self._head.set_result(self._failed(got, kind, data))
+            return True
+
+    async def _pass(self, got: Answer, *, events: bool, drops_usage: bool) -> None:
+        """Passes on the answer's bytes, the last of them after the request is in the ledger."""
+        relay = self._relay
+        shape = FREE if self._route.free else SHAPES[self._route.api]
+        reader = self._reader = AnswerReader(shape, events=events, drops_usage=drops_usage)
+        self._head.set_result(StreamingResponse(self._stream(), got.status, relay.headers_of(got)))
+        async for data in _unpacked(got):
+            if self._first_s is None:
+                self._first_s = time.monotonic() - self._begun
+            if relay.order.record != "off":
+                self._recorded = min(self._recorded + len(data), MAX_RECORDED_BYTES)
+            passed = reader.feed(data)
+            self.hold(self._base + reader.held + len(passed))
+            if reader.complete:
+                self._write()
+            await self._put(relay.clean(passed))
+        passed = relay.clean(reader.end())
+        self._write()
+        await self._put(passed)
 
     def _failed(self, got: Answer, kind: str, data: bytes) -> Response:
         """The answer for one that is no success of this API."""
         relay, status = self._relay, got.status
-        shown = relay.clean(data[:_SHOWN]).decode("utf-8", "replace").strip()
-        base, kind_shown = relay.upstream.shown, kind or "no content type"
-        came = f"base_url {base} answered {status} with {kind_shown}: {shown!r}"
+        is_words = kind == "text/plain"
+        shown = relay.clean(data)[: _MAX_WORDS if is_words else _SHOWN].decode("utf-8", "replace").strip()
+        came = (
+            f"base_url {relay.upstream.shown} answered {status} with {kind or 'no content type'}: {shown!r}"
+        )
         if status < 400:
-            self._write(broken=True)
-            return relay.refused(apis.INVALID, f"{came}; the base URL of a model API answers with JSON")
+            why = f"{came}; the base URL of a model API answers with JSON"
+            return relay.refusal(_RefusedError(apis.INVALID, why))
         headers, wait_s = relay.headers_of(got), 0.0
-        if status in (408, 429) or status >= 500:
+        if _NO_QUOTA in data:
+            relay.once(f"{relay.upstream.shown} answered {status}: the account has no quota left")
+            headers = {name: each for name, each in headers.items() if name != "retry-after"} | _FINAL
+        elif status in (408, 429) or status >= 500:
             wait_s = relay.trouble(f"answered {status}", _stated_s(got.headers, relay.now()))
-            headers["retry-after"] = f"{wait_s:.0f}"
-            if wait_s > MAX_RETRY_S:
-                headers["x-should-retry"] = "false"
+            headers |= {"retry-after": f"{wait_s:.0f}"} | (_FINAL if wait_s > MAX_RETRY_S else {})
         self._write(wait_s=wait_s)
-        if kind.endswith("json"):
-            return Response(relay.clean(data), status, headers)
-        return relay.refused(apis.UNREACHABLE._replace(status=status), came, more=headers)
+        if kind.endswith("json") or data.lstrip()[:1] in (b"{", b"["):
+            return Response(relay.clean(data), status, headers | {"content-type": "application/json"})
+        return relay.refusal(_RefusedError(apis.UNREACHABLE._replace(status=status), came, headers))
 
-    async def _passed(self, got: Answer, reader: AnswerReader) -> AsyncIterator[bytes]:
-        """The answer's bytes, the last of them after the request is in the ledger."""
-        cleaner = Cleaner(self._relay.secrets)
-        async for data in _unpacked(got):
-            if self._first_s is None:
-                self._first_s = time.monotonic() - self._begun
-            passed = reader.feed(data)
-            if reader.complete:
-                self._write()
-            if passed and (cleaned := cleaner.feed(passed)):
-                yield cleaned
-        last = reader.end()
-        self._write()
-        if cleaned := cleaner.feed(last) + cleaner.end():
-            yield cleaned
+    async def _stream(self) -> AsyncIterator[bytes]:
+        while (piece := await self._pieces.get()) is not None:
+            if isinstance(piece, Exception):
+                raise piece
+            yield piece
 
-    def _write(self, **more: Any) -> None:
-        """Counts the request, once."""
+    async def _put(self, piece: bytes | Exception | None) -> None:
+        parts: list[Any] = [piece]
+        if isinstance(piece, bytes):
+            parts = [piece[at : at + _CHUNK] for at in range(0, len(piece), _CHUNK)]
+        for part in parts:
+            if not self._left:
+                await self._pieces.put(part)
+
+    def _write(self, error: Exception | None = None, **more: Any) -> None:
+        """Counts the request, once. One that broke off is charged for its input at least, and for all that it might
+        have used if its provider had the time for that."""
         if self._written:
             return
         self._written = True
-        if self._reader is not None:
-            more |= self._reader.metered(len(self._body))
+        tier = self._facts.tier
+        if self._reader is not None and not self._route.free:
+            more |= self._reader.metered(self._facts.input)
+            tier = more.pop("tier") or tier
+        elif not self._line.status and not isinstance(error, NOT_SENT) and not self._route.free:
+            late = isinstance(error, httpcore.ReadTimeout)
+            usage = self.reserve.usage if late else Usage(input_noncached=self._facts.input)
+            more |= {"usage": usage, "estimated": True}
+        more["tier"] = "" if tier in requests.USUAL_TIERS else tier
         more["first_s"] = None if self._first_s is None else round(self._first_s, 4)
         more["whole_s"] = round(time.monotonic() - self._begun, 4)
-        self._relay.count(msgspec.structs.replace(self._line, status=self._status, **more))
-
-
-class _Streamed(StreamingResponse):
-    """Closes the exchange, also when the agent has gone before the first byte."""
-
-    def __init__(self, exchange: _Exchange, *given: Any) -> None:
-        super().__init__(*given)
-        self._exchange = exchange
-
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        try:
-            async with _while_there(receive):
-                await self.stream_response(send)
-        finally:
-            await self._exchange.close()
-
-
-@contextlib.asynccontextmanager
-async def _while_there(receive: Receive) -> AsyncIterator[None]:
-    """Ends what is inside when the agent goes, and raises ClientDisconnect then. The request's body has to
-    be read before."""
-    task, watching = asyncio.current_task(), True
-    assert task is not None
-
-    def hung_up(_: asyncio.Future[Any]) -> None:
-        if watching:
-            task.cancel()
-
-    # After the body, the next message is the end of the connection.
-    gone = asyncio.ensure_future(receive())
-    gone.add_done_callback(hung_up)
-    try:
-        yield
-    except asyncio.CancelledError:
-        if not gone.done():
-            raise
-        task.uncancel()
-        raise ClientDisconnect from None
-    finally:
-        watching = False
-        gone.cancel()
-
-
-async def _whole(pieces: AsyncIterator[bytes], what: str, limit: int) -> bytes:
-    """All pieces together. Raises ValueError when they are longer."""
-    data = bytearray()
-    async for piece in pieces:
-        data += piece
-        if len(data) > limit:
-            raise ValueError(f"the {what} has more than {limit:,} bytes")
-    return bytes(data)
+        self._relay.count(msgspec.structs.replace(self._line, **more), self.reserve)
 
 
 async def _unpacked(answer: Answer) -> AsyncIterator[bytes]:

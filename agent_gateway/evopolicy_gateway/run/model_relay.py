@@ -92,7 +92,7 @@ class ModelRelay(Kept):
         await super().end(grace_s)
         plan, used = self._run.plan, ledger.read(self._run.folder.model_requests)
         config = plan.known_config
-        tokens = used.usage.recorded(None if config is None else config.prices)
+        tokens = used.recorded(None if config is None else config.prices)
         self._run.note(f"model use: {used.requests:,} requests ({used.failed:,} failed), {use_words(tokens)}")
 
 

@@ -272,7 +272,7 @@ def _complete(folder: RunFolder, plan: Plan, facts: dict[str, Any]) -> dict[str,
     known["model_string"] = known.get("model_string") or max(
         used.models, key=used.models.__getitem__, default=None
     )
-    known["tokens"] = used.usage.recorded(terms.prices)
+    known["tokens"] = used.recorded(terms.prices)
     known["model_use"] = schema.ModelUse(
         metering="relay",
         limits=limits,

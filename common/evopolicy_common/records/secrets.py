@@ -7,6 +7,7 @@ found by keyed digests in the private file `PASSED` of the run's folder, which i
 from __future__ import annotations
 
 import contextlib
+import functools
 import hashlib
 import os
 import re
@@ -33,6 +34,7 @@ _MAX_PASSED = 1024
 _MAX_FILE_BYTES = 1 << 20
 _MIN_SECRET = 8
 """Minimal length of a known secret; shorter values are words, and would remove half of a log."""
+_ESCAPE = re.compile(rb"\\{1,8}(?:u([0-9a-fA-F]{4})|/)")
 _SECRET_NAME = re.compile(r"KEY|TOKEN|SECRET|PASSW|CREDENTIAL|AUTH|COOKIE", re.IGNORECASE)
 _NO_SECRET_NAME = re.compile(r"SSH_AUTH_SOCK|XAUTHORITY|_FILE$|_PATH$|_SOCK$", re.IGNORECASE)
 _TOKEN_IN_URL = re.compile(r"://[^/]+/([0-9A-Za-z_-]{16,})/")
@@ -139,7 +141,21 @@ class Redaction:
 
     def __call__(self, line: bytes) -> bytes:
         """Returns the line without secrets. A JSON line stays valid JSON."""
-        return redacted(line if self._known is None else self._known.sub(REDACTED, line))
+        return redacted(self.known(line))
+
+    def known(self, line: bytes) -> bytes:
+        """Returns the line without the known secrets, also where JSON spells some of their characters as `\\u002d`."""
+        if self._known is None:
+            return line
+        line = self._known.sub(REDACTED, line)
+        # The search for spellings is slow, and a line that has one is rare.
+        return self._escaped.sub(REDACTED, line) if self._known.search(_unescaped(line)) else line
+
+    @functools.cached_property
+    def _escaped(self) -> re.Pattern[bytes]:
+        known = sorted(self.secrets, key=len, reverse=True)
+        spelt = [b"".join(map(_spelt, secret)) for secret in known if len(secret) >= _MIN_SECRET]
+        return re.compile(b"|".join(spelt))
 
     def text(self, text: str) -> str:
         """Returns the text without secrets."""
@@ -283,6 +299,23 @@ def read_passed(folder: Path) -> Passed | None:
 
 def _digest(value: bytes, key: bytes) -> str:
     return hashlib.blake2b(value, key=key, digest_size=16).hexdigest()
+
+
+def _unescaped(line: bytes) -> bytes:
+    """The line with the characters that JSON's escapes stand for."""
+    if b"\\u" not in line and b"\\/" not in line:
+        return b""
+    return _ESCAPE.sub(
+        lambda match: chr(int(match[1], 16)).encode("utf-8", "surrogatepass") if match[1] else b"/", line
+    )
+
+
+def _spelt(character: str) -> bytes:
+    """A pattern of the character as any JSON writer may spell it, also within a JSON text of a JSON text."""
+    units = character.encode("utf-16-be", "surrogatepass").hex()
+    escape = b"".join(rb"\\{1,8}u(?i:" + units[at : at + 4].encode() + b")" for at in range(0, len(units), 4))
+    plain = re.escape(character.encode("utf-8", "surrogateescape"))
+    return b"(?:" + (rb"\\{0,8}" if character in '"/\\' else b"") + plain + b"|" + escape + b")"
 
 
 def _forms(secret: str) -> set[bytes]:

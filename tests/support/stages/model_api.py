@@ -135,8 +135,8 @@ class ModelApi:
 
     def answer(self, handler: Any, request: dict[str, Any]) -> None:
         path = handler.path.partition("?")[0]
-        if path.endswith("/count_tokens"):
-            handler._send(200, b'{"input_tokens": 10}', "application/json")
+        if path.endswith(("/count_tokens", ":countTokens")):
+            handler._send(200, b'{"input_tokens": 10, "totalTokens": 10}', "application/json")
             return
         search = self._search(path, request)
         with self._lock:
@@ -154,7 +154,7 @@ class ModelApi:
         with self._lock:
             self.n_answered += 1
         events = search or _speech(path)(step, request)
-        if path.endswith((":generateContent", ":countTokens")):
+        if path.endswith(":generateContent"):
             handler._send(200, json.dumps(next(iter(events))).encode(), "application/json")
             return
         stream = "".join(

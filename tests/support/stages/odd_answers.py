@@ -97,3 +97,11 @@ def repeats_its_headers(handler: Any, _: dict[str, Any]) -> None:
 def _chunk(handler: Any, data: bytes) -> None:
     handler.wfile.write(f"{len(data):x}\r\n".encode() + data + b"\r\n")
     handler.wfile.flush()
+
+
+def chunk(document: dict[str, Any] | None) -> bytes:
+    """A further event of a stream that is not whole yet, as bytes of HTTP; None: its end."""
+    if document is None:
+        return b"0\r\n\r\n"
+    event = f"data: {json.dumps(document)}\n\n".encode()
+    return f"{len(event):x}\r\n".encode() + event + b"\r\n"

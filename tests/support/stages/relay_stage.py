@@ -22,7 +22,14 @@ NOON = 1768564800.0
 KEY = "sk-the-real-key-0123456789"
 TOKEN = "token-of-the-run-0123456789"
 TOOLS = [{"type": "function", "function": {"name": "bash"}, "name": "bash"}]
-PATHS = {"chat/completions": "openai", "responses": "openai", "messages": "anthropic"}
+GEMINI = "models/m:generateContent"
+PATHS = {
+    "chat/completions": "openai",
+    "responses": "openai",
+    "messages": "anthropic",
+    GEMINI: "google",
+    "models/m:streamGenerateContent?alt=sse": "google",
+}
 
 
 class Served:
@@ -40,8 +47,19 @@ class Served:
         return read(self.ledger)
 
     async def ask(self, path: str = "chat/completions", **more: Any) -> httpx.Response:
-        body = {"model": "m", "stream": True, "tools": TOOLS, "messages": [], "input": [], **more}
-        return await self.client.post(f"/v1/{path}", json=body)
+        """Asks for a small answer, with one tool."""
+        function = {"name": "bash", "parameters": {}}
+        usual: dict[str, Any] = {"model": "m", "stream": True}
+        if path == "chat/completions":
+            usual |= {"messages": [], "tools": [{"type": "function", "function": function}]}
+        elif path == "responses":
+            usual |= {"input": [], "tools": [{"type": "function", **function}]}
+        elif path == "messages":
+            usual |= {"messages": [], "max_tokens": 9000, "tools": [{"name": "bash", "input_schema": {}}]}
+        else:
+            usual = {"contents": [], "tools": [{"functionDeclarations": [function]}]}
+        version = "v1beta" if path.startswith("models/") else "v1"
+        return await self.client.post(f"/{version}/{path}", json={**usual, **more})
 
 
 @asynccontextmanager
@@ -50,7 +68,8 @@ async def relay(
 ) -> AsyncIterator[Served]:
     served = Served(tmp_path / "ledger.jsonl", api)
     base = f"{api.base_url}/v1" if protocol == "openai" else api.base_url
-    upstream = Upstream(protocol=protocol, base_url=base, key=KEY, **more.pop("upstream", {}))
+    given = {"base_url": base, "key": KEY, **more.pop("upstream", {})}
+    upstream = Upstream(protocol=protocol, **given)
     order = Order(upstream=upstream, token=TOKEN, ledger=str(served.ledger), **more)
     app = Relay(
         order, counted=lambda: None, note=served.notes.append, spent=served.spent.append, now=lambda: NOON
@@ -60,7 +79,9 @@ async def relay(
     async with serving(app, sock):
         headers = {"authorization": f"Bearer {TOKEN}"}
         url = f"http://127.0.0.1:{served.port}"
-        async with httpx.AsyncClient(base_url=url, headers=headers, trust_env=False) as served.client:
+        async with httpx.AsyncClient(
+            base_url=url, headers=headers, trust_env=False, timeout=60.0
+        ) as served.client:
             yield served
     await app.close()
 
@@ -75,7 +96,7 @@ def asked(
         for body in bodies:
             answers.append(await served.ask(path, **body))
 
-    return answers, played(tmp_path, script, act, **{"protocol": PATHS[path], **more})
+    return answers, played(tmp_path, script, act, **{"protocol": PATHS.get(path, "openai"), **more})
 
 
 def played(

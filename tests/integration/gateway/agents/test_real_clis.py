@@ -159,6 +159,11 @@ def test_the_relay_counts_for_a_real_cli_which_never_has_the_key(
         if harness == "qwen-acp":
             program = (*more["program"], "--acp", "--model", "gpt-5.5", "--auth-type", "openai")
             more |= {"program": program, "cli": None, "acp": AcpTable()}
+        if harness in ("codex", "claude-code"):
+            # They pass where only known fields and tools do.
+            more |= {"models": "declared", "hosted_tools": "refuse"}
+        if harness == "codex":
+            more |= {"extra_args": ("--config", 'web_search="disabled"')}
         config = AgentConfig(harness=harness, model="gpt-5.5", **more)
         record, said = jailed(tmp_path, config, timeout_s=400)
     use, tokens = record.agent.model_use, record.agent.tokens

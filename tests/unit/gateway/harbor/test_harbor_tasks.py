@@ -23,7 +23,11 @@ from evopolicy_gateway.run_folder.layout import RunFolder, save
 from evopolicy_gateway.run_folder.listener import Listener, finish
 
 URL = "http://10.0.0.5:8090"
-TOKEN = {"Authorization": "Bearer t"}
+
+
+def bearer(tasks: Path, task: str = "t") -> dict[str, str]:
+    """The header with a task's token."""
+    return {"Authorization": f"Bearer {token_of(tasks, task)}"}
 
 
 def open_run(tmp_path: Path, entry: str = "GPT 5.5 (Codex)") -> RunFolder:
@@ -46,7 +50,7 @@ def test_a_task_is_private_and_its_agent_cannot_ask_for_the_score(tmp_path: Path
     assert place == tasks / "gpt-5.5-codex-gym_acrobot-first"
     files = [path for path in place.rglob("*") if path.is_file()]
     assert {stat.S_IMODE(path.stat().st_mode) & 0o077 for path in files} == {0}
-    token = token_of(tasks)
+    token = token_of(tasks, place.name)
     assert [path.name for path in files if token in path.read_text()] == ["test.sh"]
     assert f"{URL}/{place.name}" in (place / "tests/test.sh").read_text()
     assert subprocess.run(["sh", "-n", place / "tests/test.sh"], check=False).returncode == 0
@@ -119,8 +123,8 @@ def test_a_run_ending_in_a_request_keeps_its_score(tmp_path: Path, monkeypatch: 
         finish(folder)
 
     monkeypatch.setattr(scores, "finish", end)
-    client = TestClient(make_app({"t": folder}, "t"))
-    assert [client.post("/t", headers=TOKEN).status_code for _ in range(2)] == [202, 200]
+    client = TestClient(make_app({"t": folder}, tmp_path))
+    assert [client.post("/t", headers=bearer(tmp_path)).status_code for _ in range(2)] == [202, 200]
 
 
 def test_a_run_that_no_remote_agent_plays_has_no_task(tmp_path: Path) -> None:
@@ -129,30 +133,14 @@ def test_a_run_that_no_remote_agent_plays_has_no_task(tmp_path: Path) -> None:
     assert not (tmp_path / "tasks").exists()
 
 
-def test_a_verifier_ends_the_run_and_gets_its_score(tmp_path: Path) -> None:
+def test_a_verifier_ends_its_own_run_and_gets_its_score(tmp_path: Path) -> None:
+    """The tasks of a folder shared one token: whoever had one task's could end every other run."""
     folder = open_run(tmp_path)
-    client = TestClient(make_app({"t": folder}, "t"))
-    for headers in ({}, {"Authorization": "Bearer u"}, {b"Authorization": b"Bearer \xe9"}):
+    client = TestClient(make_app({"t": folder, "other": folder}, tmp_path))
+    wrong = ({}, {"Authorization": "Bearer u"}, {b"Authorization": b"Bearer \xe9"}, bearer(tmp_path, "other"))
+    for headers in wrong:
         assert client.post("/t", headers=headers).status_code == 401
     assert not folder.finish.exists()
-    assert client.post("/other", headers=TOKEN).status_code == 404
-    assert client.get("/t", headers=TOKEN).status_code == 405
-    assert client.post("/t", headers=TOKEN).status_code == 202
-    assert folder.finish.exists()
-    versions = [Version({"policy.py": "x = 1"}, (1.0, 2.0), 0.5)]
-    scored = RunFolder(write_run(tmp_path / "scored", versions, heldout=(0.1, 0.2)))
-    answer = TestClient(make_app({"t": scored}, "t")).post("/t", headers=TOKEN)
-    assert (answer.status_code, float(answer.text)) == (200, (0.1 + 0.2) / 2)
-
-
-def test_a_run_without_a_score_has_no_reward(tmp_path: Path) -> None:
-    folder = open_run(tmp_path)
-    whole = RunFolder(write_run(tmp_path / "scored", [Version({"policy.py": "x = 1"}, (1.0, 2.0), 0.5)]))
-    record = json.loads(whole.run_json.read_text())
-    record["outcome"] |= {"status": "no_ok_submit", "final_score": 0.0}
-    folder.run_json.write_text(json.dumps(record))
-    client = TestClient(make_app({"t": folder, "gone": RunFolder(tmp_path / "gone")}, "t"))
-    answer = client.post("/t", headers=TOKEN)
-    assert answer.status_code == 409
-    assert "has no score: no working submit" in answer.text
-    assert client.post("/gone", headers=TOKEN).status_code == 409
+    assert client.post("/missing", headers=bearer(tmp_path, "missing")).status_code == 404
+    assert client.get("/t", headers=bearer(tmp_path)).status_code == 405
+    assert client.post("/t", headers=bearer(tmp_path)).status_code == 202

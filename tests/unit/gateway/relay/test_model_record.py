@@ -36,21 +36,24 @@ def contents(folder: Path) -> bytes:
 @pytest.mark.parametrize(("path", "protocol"), PATHS.items())
 def test_a_call_is_recorded_whole_and_once(tmp_path: Path, path: str, protocol: Protocol) -> None:
     said = [{"role": "user", "content": [{"type": "text", "text": "x" * 99}]}]
+    field = "contents" if protocol == "google" else "input" if path == "responses" else "messages"
+    name = path.partition("?")[0]
 
     async def act(served: Served) -> None:
         for n in range(2):
             more = [*said, {"role": "user", "content": f"turn {n}"}]
-            assert "hello" in (await served.ask(path, messages=more, input=more)).text
-        assert (await served.client.get("/v1/models")).status_code == 200
+            assert "hello" in (await served.ask(path, **{field: more})).text
+        models = "/v1beta/models" if protocol == "google" else "/v1/models"
+        assert (await served.client.get(models)).status_code == 200
 
     recorded(tmp_path, [Step(text="hello"), Step(text="hello")], act, protocol=protocol)
     folder = tmp_path / "model"
     calls = read_calls(folder)
     facts = [(call.n, call.api, call.status, call.broken) for call in calls]
-    assert facts == [(n, api, 200, False) for n, api in enumerate((path, path, "models"))]
+    assert facts == [(n, api, 200, False) for n, api in enumerate((name, name, "models"))]
     assert calls[0].digest != calls[1].digest
     with contextlib.closing(Pack(folder)) as pack:
-        assert request_of(pack, calls[1])["messages"][-1]["content"] == "turn 1"
+        assert request_of(pack, calls[1])[field][-1]["content"] == "turn 1"
         assert b"hello" in pack.get(calls[0].answer)
     assert contents(folder).count(b"x" * 99) == 1
 
@@ -139,7 +142,7 @@ def test_a_replay_answers_from_the_record_until_a_request_differs(tmp_path: Path
 
     async def again(served: Served) -> None:
         await act(served)
-        assert (await served.client.post("/v1/models", json={})).status_code == 400
+        assert (await served.client.get("/v1/models")).status_code == 400
         assert (await served.ask(n=1)).status_code == 400
         assert (await served.ask(n=3)).headers["x-should-retry"] == "false"
 

@@ -1,0 +1,309 @@
+"""Reads an agent's requests: their model, their tools, their service tier, and most tokens that they can use. No I/O.
+
+`RULES` has the fields and tools of each API that a run with `models = "declared"` or `hosted_tools = "refuse"` may use.
+A template of known fields is a dict of templates by name, a list of the template of its elements, a text that has to
+be the value, or `ANY`.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterator
+from typing import Any
+
+import msgspec
+import orjson
+
+from evopolicy_gateway.relay.answers import CHARS_PER_TOKEN, MAX_TOKENS, values
+
+ANY = None
+MAX_MARKS = 2_000_000
+"""Limit of commas, colons and brackets in a body: each element of a document takes about 100 bytes of memory."""
+DEFAULT_OUTPUT = 128_000
+"""Most output tokens of an answer whose request states no limit."""
+USUAL_TIERS = ("", "auto", "default", "standard", "standard_only")
+"""Service tiers at the usual prices."""
+_TIERS = ("servicetier", "speed")
+_MAX_NAMES, _SHOWN = 20, 200
+
+
+def _fields(names: str, **nested: Any) -> dict[str, Any]:
+    return dict.fromkeys(names.split(), ANY) | nested
+
+
+class Rules(msgspec.Struct, frozen=True, kw_only=True):
+    """What a request of an API may have."""
+
+    fields: dict[str, Any]
+    tools: dict[str, Any]
+    """Templates of the tools that the agent runs, by kind."""
+    most: tuple[str, ...]
+    """Paths of the most output tokens of one answer."""
+    hosted: dict[str, Any] = {}
+    """Templates of tools that the provider runs."""
+    answers: str = ""
+    """Path of the number of answers."""
+
+
+_FUNCTION = "name description parameters strict"
+_WEB = "type name cache_control max_uses allowed_domains blocked_domains user_location defer_loading allowed_callers"
+_CLAUDES = "type name cache_control defer_loading strict allowed_callers input_examples eager_input_streaming"
+_SAMPLING = (
+    "model stream stream_options tools tool_choice parallel_tool_calls temperature top_p metadata user store"
+)
+_KEEPING = "service_tier safety_identifier prompt_cache_key prompt_cache_retention top_logprobs"
+_RESPONSES_TOOLS: dict[str, Any] = {
+    "function": _fields(f"type {_FUNCTION} defer_loading"),
+    "custom": _fields("type name description format defer_loading"),
+    "local_shell": _fields("type"),
+    "shell": _fields("type", environment={"type": "local", "skills": ANY}),
+    "apply_patch": _fields("type"),
+    "tool_search": _fields("type description parameters", execution="client"),
+    "computer": _fields("type"),
+    "computer_use_preview": _fields("type display_width display_height environment"),
+    "namespace": _fields("type name description"),
+}
+RULES: dict[str, Rules] = {
+    "chat/completions": Rules(
+        fields=_fields(
+            f"{_SAMPLING} {_KEEPING} messages max_tokens max_completion_tokens top_k min_p n stop seed logit_bias"
+            " presence_penalty frequency_penalty repetition_penalty logprobs response_format reasoning_effort"
+            " reasoning include_reasoning reasoning_split verbosity thinking enable_thinking thinking_budget"
+            " preserve_thinking clear_thinking tool_stream chat_template_kwargs modalities prediction random_seed"
+            " safe_prompt prompt_mode usage"
+        ),
+        tools={
+            "function": _fields("type cache_control", function=_fields(_FUNCTION)),
+            "custom": _fields("type", custom=_fields("name description format")),
+        },
+        most=("max_completion_tokens", "max_tokens"),
+        answers="n",
+    ),
+    "responses": Rules(
+        fields=_fields(
+            f"{_SAMPLING} {_KEEPING} input instructions max_output_tokens max_tool_calls reasoning text include"
+            " client_metadata truncation previous_response_id context_management background"
+        ),
+        tools=_RESPONSES_TOOLS,
+        hosted={
+            "web_search": _fields(
+                "type filters user_location search_context_size external_web_access search_content_types"
+            ),
+            "web_search_preview": _fields("type user_location search_context_size"),
+            "code_interpreter": _fields("type container"),
+            "file_search": _fields("type vector_store_ids max_num_results ranking_options filters"),
+        },
+        most=("max_output_tokens",),
+    ),
+    "messages": Rules(
+        fields=_fields(
+            "model messages system max_tokens stream tools tool_choice temperature top_p top_k stop_sequences metadata"
+            " thinking output_config output_format service_tier speed inference_geo context_management cache_control"
+        ),
+        tools={
+            "custom": _fields(f"{_CLAUDES} description input_schema"),
+            "bash": _fields(_CLAUDES),
+            "text_editor": _fields(f"{_CLAUDES} max_characters"),
+            "memory": _fields(_CLAUDES),
+            "computer": _fields(f"{_CLAUDES} display_width_px display_height_px display_number enable_zoom"),
+        },
+        hosted={
+            "web_search": _fields(_WEB),
+            "web_fetch": _fields(f"{_WEB} citations max_content_tokens"),
+            "code_execution": _fields("type name cache_control"),
+            "tool_search_tool_regex": _fields("type name cache_control"),
+            "tool_search_tool_bm25": _fields("type name cache_control"),
+        },
+        most=("max_tokens",),
+    ),
+    "generateContent": Rules(
+        fields=_fields(
+            "contents systemInstruction generationConfig safetySettings tools toolConfig labels serviceTier"
+        ),
+        tools={
+            "functionDeclarations": {
+                "functionDeclarations": [
+                    _fields(
+                        "name description behavior parameters parametersJsonSchema parameters_json_schema response"
+                        " responseJsonSchema response_json_schema"
+                    )
+                ]
+            },
+            "computerUse": {"computerUse": _fields("environment excludedPredefinedFunctions")},
+        },
+        hosted={kind: {kind: ANY} for kind in ("googleSearch", "urlContext", "codeExecution")},
+        most=("generationConfig.maxOutputTokens", "generation_config.max_output_tokens"),
+        answers="generationConfig.candidateCount",
+    ),
+}
+RULES["messages/count_tokens"] = RULES["messages"]
+RULES["countTokens"] = RULES["generateContent"]
+_HOSTED_FIELDS = (
+    *("mcp_servers", "plugins", "prompt", "container", "cachedContent"),
+    *("web_search_options", "enable_search", "search_parameters"),
+)
+"""Other fields that let the provider run tools; a stored prompt or cache may have some."""
+
+
+class Facts(msgspec.Struct, frozen=True, kw_only=True):
+    """What the relay needs to know of a request."""
+
+    body: bytes = b""
+    """The document as it was understood; empty for a request without."""
+    with_counts: bytes | None = None
+    """The body that also asks for counts, where the request is for a stream that would have none."""
+    asked: str = ""
+    """The model."""
+    hosted: tuple[str, ...] = ()
+    """Kinds of tools that the provider runs."""
+    unknown: str = ""
+    """The first place with a field or tool that `RULES` do not know; empty: none."""
+    tier: str = ""
+    """Service tier, where it is not a usual one."""
+    background: bool = False
+    n_answers: int = 1
+    input: int = 0
+    """Estimated tokens of the input."""
+    output: int = 0
+    """Most tokens of the output, of all answers together."""
+
+
+def facts(api: str, body: bytes, model: str | None) -> Facts:
+    """Reads a request. `model`: the one that its path names. Raises ValueError for what two readers could understand
+    in two ways, and for what is too complex."""
+    document = parsed(body)
+    rules = RULES[api]
+    kinds, unknown = _tools(document, rules)
+    kinds += [name for name in _HOSTED_FIELDS if document.get(name)]
+    unknown += _unknown({name: each for name, each in document.items() if name != "tools"}, rules.fields, "")
+    most = [n for path in rules.most for n in values(document, path) if _is_count(n)]
+    answers = next(filter(_is_count, values(document, rules.answers)), 1)
+    tiers = [each for name, each in document.items() if name.lower().replace("_", "") in _TIERS]
+    try:
+        data = orjson.dumps(document)
+        with_counts = _with_counts(document) if api == "chat/completions" else None
+    except TypeError as error:
+        raise ValueError(f"the request cannot be sent on: {error}") from error
+    return Facts(
+        body=data,
+        with_counts=with_counts,
+        asked=(str(document.get("model", "")) if model is None else model)[:_SHOWN],
+        hosted=tuple(sorted(set(kinds))[:_MAX_NAMES]),
+        unknown=next(iter(unknown), ""),
+        tier=next((str(tier)[:_SHOWN] for tier in tiers if tier not in (None, *USUAL_TIERS)), ""),
+        background=bool(document.get("background")),
+        n_answers=answers,
+        input=len(data) // CHARS_PER_TOKEN,
+        output=min(max(most, default=DEFAULT_OUTPUT) * answers, MAX_TOKENS),
+    )
+
+
+def parsed(body: bytes) -> dict[str, Any]:
+    """The JSON object of a body. Raises ValueError."""
+    if sum(body.count(mark) for mark in b",:[{") > MAX_MARKS:
+        raise ValueError(f"the request has more than {MAX_MARKS:,} values")
+    try:
+        document = json.loads(body.decode(), object_pairs_hook=_once, parse_constant=_no_number)
+    except RecursionError as error:
+        raise ValueError("the request is nested too deeply") from error
+    if not isinstance(document, dict):
+        raise ValueError("the request is not a JSON object")
+    return document
+
+
+def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    found = dict(pairs)
+    if len(found) < len(pairs):
+        names = [name for name, _ in pairs]
+        twice = next(name for name in names if names.count(name) > 1)
+        raise ValueError(f"the field {twice[:_SHOWN]!r} occurs twice in one object")
+    return found
+
+
+def _no_number(text: str) -> None:
+    raise ValueError(f"{text} is not a number of JSON")
+
+
+def _is_count(value: Any) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool) and 0 < value <= MAX_TOKENS
+
+
+def _with_counts(document: dict[str, Any]) -> bytes | None:
+    options = document.get("stream_options") or {}
+    if document.get("stream") is not True or not isinstance(options, dict) or options.get("include_usage"):
+        return None
+    return orjson.dumps(document | {"stream_options": options | {"include_usage": True}})
+
+
+def _tools(document: dict[str, Any], rules: Rules) -> tuple[list[str], list[str]]:
+    """The kinds of tools that the provider runs, without the version of Anthropic's, and the places of unknown parts.
+    An unknown kind counts as one of these."""
+    hosted: list[str] = []
+    unknown: list[str] = []
+    for at, tool in _offered(document):
+        if not isinstance(tool, dict):
+            unknown.append(at)
+        for kind, part in _kinds(tool, rules):
+            known = rules.tools.get(kind)
+            if known is None or (kind == "shell" and next(_unknown(part, known, at), "")):
+                hosted.append(kind[:_SHOWN])
+                known = known or rules.hosted.get(kind, {})
+            unknown += list(_unknown(part, known, at))[:1]
+    return hosted, unknown
+
+
+def _offered(document: dict[str, Any]) -> Iterator[tuple[str, Any]]:
+    """Every tool with its place: those of a message (a search for tools brings some) and of a namespace too."""
+    items = document.get("input")
+    holders = [("", document)] + [
+        (f"input[{n}].", item)
+        for n, item in enumerate(items if isinstance(items, list) else ())
+        if isinstance(item, dict) and "tools" in item
+    ]
+    while holders:
+        at, holder = holders.pop()
+        tools = holder.get("tools")
+        for n, tool in enumerate(tools if isinstance(tools, list) else [tools] if tools else ()):
+            place = f"{at}tools[{n}]"
+            if isinstance(tool, dict) and tool.get("type") == "namespace":
+                holders.append((f"{place}.", tool))
+                tool = {name: each for name, each in tool.items() if name != "tools"}
+            yield place, tool
+
+
+def _kinds(tool: Any, rules: Rules) -> list[tuple[str, dict[str, Any]]]:
+    """The kinds in a tool, each with its part: Google's may hold several."""
+    if not isinstance(tool, dict):
+        return []
+    if "functionDeclarations" in rules.tools:
+        return [
+            (re.sub(r"_([a-z])", lambda match: match[1].upper(), name), {name: each})
+            for name, each in tool.items()
+        ]
+    return [(re.sub(r"_\d{8}$", "", str(tool.get("type") or "custom")), tool)]
+
+
+def _unknown(value: Any, known: Any, at: str) -> Iterator[str]:
+    """The places in `value` that a template does not know."""
+    if isinstance(known, str):
+        if value != known:
+            yield f"{at} = {str(value)[:_SHOWN]}"
+    elif isinstance(known, list) and isinstance(value, list):
+        for n, each in enumerate(value):
+            yield from _unknown(each, known[0], f"{at}[{n}]")
+    elif isinstance(known, dict) and isinstance(value, dict):
+        # A text in a template has to be there.
+        needed = [name for name, each in known.items() if isinstance(each, str) or _has_text(each)]
+        for name in dict.fromkeys((*value, *needed)):
+            place = f"{at}.{name[:_SHOWN]}".removeprefix(".")
+            if name in known:
+                yield from _unknown(value.get(name), known[name], place)
+            else:
+                yield place
+    elif known is not ANY:
+        yield at
+
+
+def _has_text(known: Any) -> bool:
+    return isinstance(known, dict) and any(isinstance(each, str) for each in known.values())
