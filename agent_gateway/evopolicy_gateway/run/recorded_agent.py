@@ -36,7 +36,13 @@ _OWN = tuple(f"run.json: agent.{name}" for name in ("model_use.", "settings.agen
 """Values of a replay's own, or of its machine."""
 _VERSIONS = tuple(
     f"run.json: {name}"
-    for name in ("versions.harness:", "versions.env:", "versions.fingerprint", "agent.cli_version:")
+    for name in (
+        "record_version:",
+        "versions.harness:",
+        "versions.env:",
+        "versions.fingerprint",
+        "agent.cli_version:",
+    )
 )
 """They may explain a difference, and are none."""
 

@@ -34,6 +34,39 @@ ELSEWHERE = "elsewhere"
 """Value of `RunSettings.agent_host`: the operator vouches that the agent is on no machine of the cluster."""
 
 
+_BY_STRENGTH = {
+    "jail": ("bwrap", "bwrap, open network", "unknown", "none"),
+    "sandbox_tier": ("bwrap", "landlock", "unknown", "none"),
+    "metering": ("nothing", "relay", "unknown", "agent"),
+}
+"""Values of `Line`, the strongest first; any other counts as `unknown`."""
+
+
+class Line(msgspec.Struct, frozen=True, kw_only=True):
+    """The weakest conditions of a line of runs, each of which starts from the one before. `unknown`: a run has not told
+    them."""
+
+    jail: Word = "unknown"
+    """As in `run.json`."""
+    sandbox_tier: Word = "unknown"
+    metering: Word = "unknown"
+    """By whom tokens were counted: `relay`, `agent`, or `nothing` without a model."""
+
+    def weakest(self, other: Line) -> Line:
+        """The weaker condition of both, each in turn."""
+
+        def weaker(name: str, order: tuple[str, ...]) -> str:
+            values = (getattr(self, name), getattr(other, name))
+            return order[max(order.index(each if each in order else "unknown") for each in values)]
+
+        return Line(**{name: weaker(name, order) for name, order in _BY_STRENGTH.items()})
+
+
+def metering_of(counted_by: str | None, model: str | None) -> str:
+    """`Line.metering` of a run. `counted_by`: `agent.model_use.metering`, None without; `model`: that of the agent."""
+    return counted_by or ("unknown" if model else "nothing")
+
+
 class Start(msgspec.Struct, frozen=True, kw_only=True):
     """The submit of an earlier run from whose workspace a run starts."""
 
@@ -44,6 +77,13 @@ class Start(msgspec.Struct, frozen=True, kw_only=True):
     """SHA-256, hex, of the recorded workspace, as that run's gateway named it with the submit."""
     parent_scored: bool = False
     """Set by the coordinator: the earlier agent had ended, so that a result may have chosen the place."""
+    line: Line = Line()
+    """Set by the coordinator: the weakest conditions of the runs before. `unknown` while one of their agents is alive:
+    jail and metering are told when a run closes."""
+
+    @property
+    def text(self) -> str:
+        return f"submit {self.submit_index} of {self.run}"
 
 
 class RunSettings(msgspec.Struct, frozen=True, kw_only=True):

@@ -26,7 +26,7 @@ from evopolicy_common.messages.bounds import Int, Many, Named, Number, Plain, Wo
 from evopolicy_common.messages.environment import Case
 from evopolicy_common.messages.gateway import SubmitStatus
 from evopolicy_common.messages.operator import RunFinished
-from evopolicy_common.messages.run_settings import RunSettings
+from evopolicy_common.messages.run_settings import RunSettings, Start
 
 EMPTY_HEAD = hashlib.sha256(b"evopolicy journal 1").hexdigest()
 SALT_BYTES = 32
@@ -52,6 +52,8 @@ class Opened(msgspec.Struct, frozen=True, kw_only=True, tag="opened", tag_field=
     at: Number
     """Unix time, seconds."""
     replay_of: Word = ""
+    """As in the settings."""
+    start: Start | None = None
     """As in the settings."""
 
 

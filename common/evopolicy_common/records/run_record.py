@@ -28,7 +28,7 @@ from evopolicy_common.messages.environment import (
 from evopolicy_common.messages.episode import FailureCategory, ResourceLimits, Tier
 from evopolicy_common.messages.gateway import FeedbackDetail, FinishRule, Profile, SimulationRule, VideoOption
 from evopolicy_common.messages.operator import Committed, RunEnd
-from evopolicy_common.messages.run_settings import HiddenCases, HiddenIsolation, Start
+from evopolicy_common.messages.run_settings import HiddenCases, HiddenIsolation, Line, Start, metering_of
 from evopolicy_common.records.code_metrics import PUBLISHED_SCHEMA
 from evopolicy_common.records.model_record import Level
 from evopolicy_common.records.newest import described_data
@@ -453,6 +453,14 @@ class RunRecord(msgspec.Struct, frozen=True, kw_only=True):
     """The coordinator's name of the run that `evopolicy replay` played again; empty: a run of its own."""
     trees: dict[str, str] = {}
     """Submit index (decimal text) to the SHA-256 of `trees/submit_NNN.json`; empty in older files."""
+
+    @property
+    def line(self) -> Line:
+        """The weakest conditions of this run and of those that it starts from."""
+        use = self.agent.model_use
+        metering = metering_of(None if use is None else use.metering, self.agent.model_string)
+        own = Line(jail=self.jail, sandbox_tier=self.sandbox_tier, metering=metering)
+        return own if self.start is None else own.weakest(self.start.line)
 
 
 class _Header(msgspec.Struct, frozen=True, kw_only=True):

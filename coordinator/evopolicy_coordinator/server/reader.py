@@ -154,12 +154,12 @@ class ServiceReader:
         """A finished run as it was created; None for any other run. Reads the database."""
         return self._reader.one(RunRow, run=run) if run and self._reader.finished(run) is not None else None
 
-    def parent(self, start: Start) -> tuple[RunRow | None, SubmitRow | None, bool]:
-        """The run and the submit that `start` names, None for an unknown one, and whether that run's agent has ended.
-        Reads the database."""
+    def parent(self, start: Start) -> tuple[RunRow | None, SubmitRow | None, RunStateRow | None]:
+        """The run and the submit that `start` names, and that run's state; None for an unknown one. Reads the
+        database."""
         submit = self._reader.one(SubmitRow, run=start.run, submit_index=start.submit_index)
         state = self._reader.one(RunStateRow, run=start.run)
-        return self._reader.one(RunRow, run=start.run), submit, state is not None and state.phase != "open"
+        return self._reader.one(RunRow, run=start.run), submit, state
 
     def replayed(self, run: str) -> RunRow | None:
         """The finished run that is to be played again; None for none and for an unknown one. Reads the database. Raises

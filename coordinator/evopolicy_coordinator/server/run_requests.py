@@ -28,8 +28,10 @@ from evopolicy_common.messages.environment import Case, Split, StepLimit
 from evopolicy_common.messages.run_settings import (
     MAX_EPISODES_PER_SUBMIT,
     PUBLISHED_TRAIN,
+    Line,
     RunSettings,
     episode_counts,
+    metering_of,
     off_profile,
 )
 from evopolicy_common.records.blobs import BlobStore
@@ -164,7 +166,8 @@ class RunRequests:
             )
         wanted, known = m.settings, of.settings
         if wanted.start is not None and known.start is not None:
-            wanted = replace(wanted, start=replace(wanted.start, parent_scored=known.start.parent_scored))
+            own = {name: getattr(known.start, name) for name in ("parent_scored", "line")}
+            wanted = replace(wanted, start=replace(wanted.start, **own))
         same = replace(known, replay_of=of.run, notes=wanted.notes)
         names = [each for each in wanted.__struct_fields__ if getattr(wanted, each) != getattr(same, each)]
         if names:
@@ -326,7 +329,7 @@ def _started(reader: ServiceReader, wanted: RunSettings) -> tuple[RunSettings, t
     Raises ConfigError for a start that is not as its gateway recorded it."""
     start = wanted.start
     assert start is not None
-    parent, submit, ended = reader.parent(start)
+    parent, submit, state = reader.parent(start)
     where = f"start from submit {start.submit_index} of run {start.run}"
     if parent is None or submit is None:
         raise ConfigError(f"{where}: this coordinator has no such submit; name a run that it has played")
@@ -339,10 +342,25 @@ def _started(reader: ServiceReader, wanted: RunSettings) -> tuple[RunSettings, t
         raise ConfigError(
             f"{where}: it is a run on {parent.settings.env}, not {wanted.env}; name its environment"
         )
-    before = parent.settings.start
+    before, ended = parent.settings.start, state is not None and state.phase != "open"
+    line = _conditions(parent, {} if state is None else state.agent)
+    if before is not None:
+        line = line.weakest(before.line)
     scored = ended or (before is not None and before.parent_scored)
     related = (*parent.validation, *parent.heldout, *parent.related)
-    return replace(wanted, start=replace(start, parent_scored=scored)), related
+    return replace(wanted, start=replace(start, parent_scored=scored, line=line)), related
+
+
+def _conditions(row: RunRow, agent: dict[str, Any]) -> Line:
+    """The conditions of one run. `agent`: as its gateway told when it closed; empty while it is open."""
+    told, own = agent.get("record"), Line(sandbox_tier=row.settings.sandbox_tier)
+    if not isinstance(told, dict):
+        return own
+    use = told.get("agent.model_use")
+    counted_by = use.get("metering") if isinstance(use, dict) else None
+    metering = metering_of(counted_by, told.get("agent.model_string"))
+    own = replace(own, jail=told.get("jail"), metering=metering)
+    return own.weakest(own)  # of known words alone: a gateway may tell anything
 
 
 def _has_derived_cases(run: RunRow | None) -> bool:

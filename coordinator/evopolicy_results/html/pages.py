@@ -213,7 +213,7 @@ _NOTICES: tuple[tuple[Callable[[Run], bool], str], ...] = (
      "played public splits, of case files or a public seed: agents and models may know the hidden cases."),
     (lambda run: run.simulation_allowed,
      "let their agent simulate, or are from before there was a rule against it."),
-    (lambda run: run.record.jail == "none", "had no jail around their agent."),
+    (lambda run: run.record.line.jail == "none", "had no jail around their agent, or that of a run they start from."),
     (lambda run: run.record.hidden_isolation == "unknown",
      "do not tell whether hidden episodes and agents shared a kernel: they are from before it was recorded."),
     (lambda run: run.record.hidden_isolation == "shared",

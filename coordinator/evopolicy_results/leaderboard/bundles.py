@@ -285,6 +285,11 @@ class Board(msgspec.Struct, kw_only=True):
     def runs(self) -> list[Run]:
         return [each.run for bundle in self.bundles for each in bundle.runs]
 
+    @property
+    def compared(self) -> list[Run]:
+        """Those that a leaderboard ranks: not the ones that start from a submit of another run."""
+        return [run for run in self.runs if run.record.start is None]
+
 
 def boards(bundles: Sequence[LabBundle]) -> list[Board]:
     """The boards, the one with most runs first. A bundle joins the first board that it is comparable with. Its runs
@@ -298,9 +303,9 @@ def boards(bundles: Sequence[LabBundle]) -> list[Board]:
     ]
     for unrecorded, bundle in sorted(parts, key=lambda part: (-len(part[1].runs), part[1].file)):
         board = Board(bundles=[bundle], unrecorded=unrecorded)
-        board.mixed = bool(mixtures(board.runs))
+        board.mixed = bool(mixtures(board.compared))
         others = [one for one in all_boards if not one.mixed and one.unrecorded == unrecorded]
-        alike = (one for one in others if not mixtures([*one.runs, *board.runs]))
+        alike = (one for one in others if not mixtures([*one.compared, *board.compared]))
         if not board.mixed and (home := next(alike, None)):
             home.bundles.append(bundle)
         else:
@@ -312,6 +317,6 @@ def boards(bundles: Sequence[LabBundle]) -> list[Board]:
                 "some of their episodes have no recording, so that no replay can contradict the returns"
             )
         if board is not all_boards[0]:
-            whole = board.runs if board.mixed else [*all_boards[0].runs, *board.runs]
-            board.apart += [str(one) for one in mixtures(whole)]
+            compared = board.compared if board.mixed else [*all_boards[0].compared, *board.compared]
+            board.apart += [str(one) for one in mixtures(compared)]
     return all_boards

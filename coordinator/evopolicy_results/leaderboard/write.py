@@ -103,6 +103,7 @@ def _write_pages(bundles: Sequence[LabBundle], out: Path, title: str, tell: Tell
                         *(run.entry, title_of(run.env), run.record.repeat),
                         "–" if run.score is None else run.score,
                         Link(run.record.exp_id, own),
+                        "usual" if run.record.start is None else run.record.start.text[:_LONG],
                         Link(f"{n} episodes", episodes) if n else "–",
                         *_named(bundle),
                     )
@@ -117,7 +118,13 @@ def _write_pages(bundles: Sequence[LabBundle], out: Path, title: str, tell: Tell
     refused = [(*_named(bundle), bundle.refused) for bundle in bundles if bundle.refused]
     for ident, name, caption, columns, rows in (
         ("files", "Files and checks", _FILES, ";".join(("File;Signed by;Runs;Left out", *kinds)), files),
-        ("runs", "Runs", _RUNS, "Entry;Environment;Repeat;Held-out mean;Run;Episodes;File;Signed by", runs),
+        (
+            "runs",
+            "Runs",
+            _RUNS,
+            "Entry;Environment;Repeat;Held-out mean;Run;Start;Episodes;File;Signed by",
+            runs,
+        ),
         ("refused", "Not shown", "No run of these files is in a board.", "File;Signed by;Why", refused),
     ):
         if rows or ident == "files":
@@ -199,7 +206,8 @@ _FILES = (
 )
 _RUNS = (
     "Each run's page shows its submits, sources and their differences. Its recorded episodes are the held-out"
-    " episodes of the selected checkpoint."
+    " episodes of the selected checkpoint. A run whose Start is a submit of another run is on no leaderboard: that"
+    " run's work and budget are in its score."
 )
 
 

@@ -30,11 +30,21 @@ from evopolicy_results.publish import contents
 from evopolicy_results.scoring import scores
 from evopolicy_results.statistics.pairs import cell_mean
 
-VERSION = 1
+VERSION = 2
 _TOLERANCE = 0.05
 _LIMITS = {
-    "policies' sandbox": ("bwrap", "Some policies ran outside the sandbox."),
-    "agents' jail": ("bwrap", "Some agents ran outside the jail, or with a network."),
+    "policies' sandbox": (
+        "bwrap",
+        "In some runs, or in runs that they start from, policies ran outside the sandbox.",
+    ),
+    "agents' jail": (
+        "bwrap",
+        "In some runs, or in runs that they start from, the agent had no jail, a network, or an unknown jail.",
+    ),
+    "workspace": (
+        "usual",
+        "Some runs start from a submit of another run, whose work and budget are in their scores.",
+    ),
     "agents beside hidden episodes": ("exclusive", "Some agents and hidden episodes could share a kernel."),
     "hidden cases": ("secret", "Some hidden cases are public: an agent's model may have seen them."),
     "rules": ("renewed", "Rules of some environments cannot be renewed: their scores may contain recall."),
@@ -75,13 +85,17 @@ class CardRun(msgspec.Struct, frozen=True, kw_only=True):
     submits: int
     episodes: int
     """Train episodes that were charged."""
+    start: str = ""
+    """The submit of another run that it starts from; empty: the usual workspace."""
 
 
 class Cell(msgspec.Struct, frozen=True, kw_only=True):
-    """All runs of an entry on an environment."""
+    """All runs of an entry on an environment from one start."""
 
     entry: str
     env: str
+    start: str = ""
+    """As of `CardRun`."""
     runs: int
     mean: float | None
     """Of the runs' scores; None where a run has none."""
@@ -154,10 +168,10 @@ def make(
     entries = [journal.read_entry(line) for line in lines]
     revealed = [each.at for each in entries if isinstance(each, journal.Revealed)]
     records = [each.record for each in sources]
-    cells: dict[tuple[str, str], list[Source]] = {}
+    cells: dict[tuple[str, str, str], list[Source]] = {}
     by_entry: dict[str, list[Source]] = {}
     for each in sources:
-        cells.setdefault((each.record.env, each.record.agent.entry), []).append(each)
+        cells.setdefault((each.record.env, each.record.agent.entry, _start(each.record)), []).append(each)
         by_entry.setdefault(each.record.agent.entry, []).append(each)
     conditions = _conditions(records)
     scores = [[each.record.outcome.score for each in cell] for cell in cells.values()]
@@ -194,10 +208,15 @@ def _run(source: Source) -> CardRun:
         heldout_cases=len(result.heldout_returns),
         submits=len(result.submits),
         episodes=result.budget_used,
+        start=_start(record),
     )
 
 
-def _cell(env: str, entry: str, sources: Sequence[Source]) -> Cell:
+def _start(record: RunRecord) -> str:
+    return "" if record.start is None else record.start.text
+
+
+def _cell(env: str, entry: str, start: str, sources: Sequence[Source]) -> Cell:
     """With the interval of reports (`docs/explanation/statistics.md`)."""
     runs = []
     for _, record, result in sources:
@@ -212,6 +231,7 @@ def _cell(env: str, entry: str, sources: Sequence[Source]) -> Cell:
     return Cell(
         entry=entry,
         env=env,
+        start=start,
         runs=len(sources),
         mean=mean(measured) if estimate else None,
         low=estimate.low if estimate else None,
@@ -244,20 +264,20 @@ def _agent(entry: str, sources: Sequence[Source]) -> AgentCost:
 def _conditions(records: Sequence[RunRecord]) -> dict[str, dict[str, dict[str, int]]]:
     counts: dict[str, dict[str, Counter[str]]] = {}
     for record in records:
-        use, versions = record.agent.model_use, record.versions
+        versions = record.versions
         settings: dict[str, Any] = msgspec.to_builtins(record.experiment_dimensions)
         limits, resources = settings.pop("limits") or {}, record.agent.resources
         entry = catalogue.known(record.env)
-        unmetered = "unknown" if record.agent.model_string else "nothing"
         topics: dict[str, dict[str, Any]] = {
             "isolation": {
-                "policies' sandbox": record.sandbox_tier,
-                "agents' jail": record.jail,
+                "policies' sandbox": record.line.sandbox_tier,
+                "agents' jail": record.line.jail,
+                "workspace": "usual" if record.start is None else "of an earlier submit",
                 "agents beside hidden episodes": record.hidden_isolation,
                 "hidden cases": "secret" if versions.data_secret else "public",
                 "rules": "renewed" if entry is not None and entry.world else "fixed",
             },
-            "metering": {"tokens counted by": use.metering if use else unmetered},
+            "metering": {"tokens counted by": record.line.metering},
             "hardware": {"processor": versions.fingerprint.get("cpu")},
             "agents' limits": msgspec.to_builtins(resources.limits) if resources else {},
             "software": {**versions.fingerprint, "cpu": None, "episodes repeat": versions.env_deterministic},

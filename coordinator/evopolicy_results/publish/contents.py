@@ -188,7 +188,7 @@ def unpack_recordings(data: bytes) -> list[bytes | None]:
 
 
 class Listed(msgspec.Struct, frozen=True, kw_only=True):
-    """A run that was opened for one of the published entries."""
+    """A run that was opened for one of the published entries, or from which a published run starts."""
 
     run: str
     entry: str
@@ -203,9 +203,14 @@ class Listed(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def listing(entries: Iterable[journal.Entry], published: Iterable[str]) -> tuple[Listed, ...]:
-    """Every run in the journal of the `published` runs' entries, in the order in which they were opened."""
+    """Every run in the journal of the `published` runs' entries, and the runs from which the published ones start, in
+    the order in which they were opened."""
     chosen, entries = set(published), list(entries)
     opened = [each for each in entries if isinstance(each, journal.Opened)]
+    line = set(chosen)
+    for each in reversed(opened):  # a run starts from one that was opened before
+        if each.run in line and each.start is not None:
+            line.add(each.start.run)
     status = {each.run: each.status for each in entries if isinstance(each, journal.Ended)}
     names = {each.entry for each in opened if each.run in chosen}
     place = operator.attrgetter("exp_id", "entry", "env", "repeat")
@@ -220,13 +225,16 @@ def listing(entries: Iterable[journal.Entry], published: Iterable[str]) -> tuple
             replaced_by="" if later == each.run else later,
         )
 
-    return tuple(listed(each) for each in opened if each.entry in names)
+    return tuple(listed(each) for each in opened if each.entry in names or each.run in line)
 
 
 def completeness(listed: Sequence[Listed]) -> str:
     """How many of the runs that were opened are left out, in words."""
     omitted = [each.state for each in listed if each.state != "published"]
     if not omitted:
-        return f"all {len(listed)} runs that the journal has of these entries are here"
+        return f"all {len(listed)} runs that the journal has of these entries and their starts are here"
     states = ", ".join(f"{omitted.count(state)} {state}" for state in sorted(set(omitted)))
-    return f"{len(omitted)} of {len(listed)} runs of these entries are left out ({states}): these runs were selected"
+    return (
+        f"{len(omitted)} of {len(listed)} runs of these entries and their starts are left out ({states}): these runs"
+        " were selected"
+    )

@@ -97,7 +97,8 @@ families, as the packages state them (none for toys):
 
 def _result(cell: Cell) -> tuple[object, ...]:
     interval = "none" if cell.low is None else f"{_number(cell.low)} to {_number(cell.high)}"
-    return cell.env, cell.entry, cell.runs, _number(cell.mean), interval, cell.over, _number(cell.random)
+    entry = f"{cell.entry}, from {cell.start}" if cell.start else cell.entry
+    return cell.env, entry, cell.runs, _number(cell.mean), interval, cell.over, _number(cell.random)
 
 
 def _cost(agent: AgentCost) -> tuple[object, ...]:

@@ -19,7 +19,7 @@ from evopolicy_common.catalogue.installs import Licence
 from evopolicy_common.errors import DECODE_ERRORS, ProtocolError
 from evopolicy_common.messages.episode import ResourceLimits
 from evopolicy_common.messages.operator import Committed
-from evopolicy_common.messages.run_settings import Start
+from evopolicy_common.messages.run_settings import Line, Start
 from evopolicy_common.records.run_record import Tokens
 from evopolicy_results.publish import contents
 
@@ -51,7 +51,7 @@ _RUN: dict[Cover, str] = {
         outcome.budget_used outcome.auxiliary.policy_failures.* outcome.auxiliary.infrastructure_retries
         outcome.auxiliary.nondeterministic_results outcome.auxiliary.code_metrics_best.**
         outcome.auxiliary.code_metrics_by_submit.** outcome.auxiliary.code_metrics_trend.**
-        versions.cases_hashes.* versions.data_secret {_all("committed", Committed)} {_all("start", Start)} trees.*
+        versions.cases_hashes.* versions.data_secret {_all("committed", Committed)} {_all("start", Start)} {_all("start.line", Line)} trees.*
         replay_of
     """,  # noqa: E501
     "committed": f"""

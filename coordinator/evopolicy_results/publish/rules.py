@@ -23,7 +23,7 @@ from evopolicy_results.publish import card as cards
 from evopolicy_results.publish import contents, descriptions, fields
 from evopolicy_results.publish.contents import Countersignature, Manifest, Removed, Signature
 from evopolicy_results.publish.findings import KINDS, UPDATE, Checked, Files, History, State, decoded
-from evopolicy_results.publish.run_rules import check_run, read_run
+from evopolicy_results.publish.run_rules import check_run, check_starts, read_run
 from evopolicy_results.publish.signatures import HEAD, signed_by
 
 T = TypeVar("T")
@@ -64,6 +64,7 @@ def check(files: Files, identity: str = "", heads: Sequence[str | Countersignatu
         seen.add(run.opening.run)
         checked.runs.append(run)
         check_run(files, run, entries, damaged, checked)
+    check_starts(checked)
     if any(name.startswith("runs/") and "/actions/" in name for name in files.names):
         text = "only --replay compares the recorded actions, single rewards and ends with the environment"
         checked.add("claims", "open", text)

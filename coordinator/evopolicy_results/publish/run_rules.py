@@ -11,6 +11,7 @@ import msgspec
 
 from evopolicy_common import catalogue
 from evopolicy_common.errors import ProtocolError
+from evopolicy_common.messages.run_settings import Line
 from evopolicy_common.records import journal
 from evopolicy_common.records.aggregates import best_validated, mean
 from evopolicy_common.records.code_metrics import TREND, code_metrics
@@ -78,6 +79,26 @@ def check_run(files: Files, run: PublishedRun, history: History, damaged: set[st
     checked.add("policies", "open", text, name)
 
 
+def check_starts(checked: Checked) -> None:
+    """Adds a finding for each run: whether it starts from another one, and under no weaker conditions than that one."""
+    lines = {run.opening.run: run.record.line for run in checked.runs}
+    for run in checked.runs:
+        start, name = run.opening.settings.start, run.opening.run
+        if start is None:
+            checked.add("starts", "ok", KINDS["starts"], name)
+            continue
+        text = f"it starts from {start.text}: that run's work and budget are in its policies and its score"
+        checked.add("starts", "open", text, name)
+        least = start.line.weakest(lines.get(start.run, start.line))
+        for condition in Line.__struct_fields__:
+            told, fixed = getattr(start.line, condition), getattr(least, condition)
+            if told not in ("unknown", fixed):
+                text = (
+                    f"its start tells {condition} {told!r} of the runs before; run {start.run} had {fixed!r}"
+                )
+                checked.add("commitment", "failed", text, name)
+
+
 def _commitment(run: PublishedRun, history: History) -> Iterator[str | Fault]:
     opening, settings, place = run.opening, run.opening.settings, run.record.committed
     numbered = history.entry(Opened, opening.run)
@@ -89,9 +110,11 @@ def _commitment(run: PublishedRun, history: History) -> Iterator[str | Fault]:
         yield f"its salt has {len(run.salt)} bytes instead of {journal.SALT_BYTES}"
     if journal.commitment(run.salt, run.opening_bytes) != entry.commitment:
         yield "splits or settings are not those that were committed to"
-    names = ("entry", "model", "env", "exp_id", "repeat", "attempt")
+    names = ("entry", "model", "env", "exp_id", "repeat", "attempt", "start")
     if entry.epoch != opening.epoch or any(getattr(entry, name) != getattr(settings, name) for name in names):
-        yield "the journal opened it for another entry, environment, experiment or epoch"
+        yield "the journal opened it for another entry, environment, experiment, epoch or start"
+    if entry.start is not None and history.entry(Opened, entry.start.run) is None:
+        yield Fault("journal", f"it starts from run {entry.start.run}, of which the journal has no entry")
     fixed = (entry.commitment, number, history.heads[number], entry.epoch)
     if place is None or (place.commitment, place.opened, place.opened_head, place.epoch) != fixed:
         yield Fault("record", "run.json tells another commitment or head of the journal than the journal has")

@@ -129,7 +129,7 @@ _BY_SUITE = {
     "failed episodes": _dimension("failed_episodes", "failed-episodes"),
     "hidden evaluation": _dimension("hidden_evaluation", "profile"),
     "profile": _dimension("profile", "profile"),
-    "jail": _Setting(lambda run: run.record.jail, "the same --jail"),
+    "jail": _Setting(lambda run: run.record.line.jail, "the same --jail"),
     "hidden cases": _dimension("hidden_cases", "hidden-cases"),
     "hidden isolation": _Setting(
         lambda run: run.record.hidden_isolation, concerns=lambda run: run.record.hidden_isolation != "unknown"

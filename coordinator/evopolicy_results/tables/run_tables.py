@@ -105,6 +105,9 @@ def _journal(run: Run) -> str | None:
     return None if place is None or place.ended is None else f"{place.ended} {place.ended_head[:16]}"
 
 
+_LINE = "The weakest of a run and of those that it starts from."
+
+
 def _agents(runs: Iterable[Run]) -> Table:
     """One row per setup of an entry: several rows show that its runs differ."""
     version = "Of the harness's program."
@@ -115,7 +118,7 @@ def _agents(runs: Iterable[Run]) -> Table:
         Column("cli_version", "Version", note=version, of="record.agent.cli_version"),
         Column("model", "Model string", of="record.agent.model_string"),
         Column("settings", "Settings", of=_settings),
-        Column("jail", "Jail", of="record.jail"),
+        Column("jail", "Jail", note=_LINE, of="record.line.jail"),
         Column(
             "hidden_isolation", "Hidden isolation", note=isolation, of=lambda r: r.record.hidden_isolation
         ),
@@ -274,7 +277,7 @@ def _audit_row(run: Run) -> dict[str, Any]:
         "wall_s": record.timing.wall_time_seconds,
         **{phase: recorded(getattr(record.timing, phase)) for phase in PHASES},
         "secret_splits": record.versions.data_secret,
-        "jail": record.jail,
+        "jail": record.line.jail,
         "hidden_isolation": record.hidden_isolation,
         "hidden_cases": dimensions.hidden_cases,
         "simulation": dimensions.simulation,

@@ -216,7 +216,7 @@ def test_selected_runs_show_what_they_were_selected_from(results: Results) -> No
     checked = rules.check(Held(results.read("one.evp")))
     assert not checked.failed
     assert [each.text for each in checked.findings if each.kind == "completeness"] == [
-        "1 of 2 runs of these entries are left out (1 completed): these runs were selected"
+        "1 of 2 runs of these entries and their starts are left out (1 completed): these runs were selected"
     ]
 
 

@@ -59,7 +59,7 @@ def test_a_sweep_with_failed_unfinished_and_replaced_runs_is_published(sweep: Pa
         ("good/toy_line/sweep-0", "it repeats the run in"),
     ):
         assert any(f"{folder}: {why}" in line for line in text.splitlines() if line.startswith("left out: "))
-    assert "of these entries are here; 3 folders were left out" in text
+    assert "of these entries and their starts are here; 3 folders were left out" in text
     evopolicy(sweep, "check", "all.evp", "--replay", "all", code=0)
     shutil.rmtree(stuck)
 

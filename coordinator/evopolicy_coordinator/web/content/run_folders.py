@@ -103,7 +103,7 @@ class RunFacts(msgspec.Struct, frozen=True, kw_only=True):
         """The run that it comes from, in words; empty for most runs."""
         if self.replay_of:
             return f"replay of {self.replay_of}"
-        return "" if self.start is None else f"from submit {self.start.submit_index} of {self.start.run}"
+        return "" if self.start is None else f"from {self.start.text}"
 
     @property
     def origin_run(self) -> str:

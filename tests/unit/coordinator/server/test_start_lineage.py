@@ -18,7 +18,7 @@ import pytest
 from rigs.service_world import Requested, World, started
 
 from evopolicy_common.messages import gateway, operator
-from evopolicy_common.messages.run_settings import RunSettings, Start
+from evopolicy_common.messages.run_settings import Line, RunSettings, Start
 from evopolicy_common.messages.worker import Refused
 from evopolicy_common.records import journal
 from evopolicy_common.wire import keys
@@ -75,7 +75,9 @@ async def test_a_start_from_an_open_run_is_committed_to_as_unscored(tmp_path: Pa
         before = await parent(world)
         wanted = Start(run=before.run, submit_index=0, tree=TREE, parent_scored=True)
         after = await create(world, "child", wanted)
-        assert start_of(world, after) == msgspec.structs.replace(wanted, parent_scored=False)
+        assert start_of(world, after) == msgspec.structs.replace(
+            wanted, parent_scored=False, line=Line(sandbox_tier="bwrap")
+        )
         assert run_of(world, after).ledger.available == 100
         documents = [row for row in rows(world.store._db, DocumentRow) if row.run == after.run]
         opening = msgspec.json.decode(documents[0].data, type=journal.Opening)
@@ -112,14 +114,54 @@ async def test_a_forged_start_is_refused(tmp_path: Path, forged: str) -> None:
 async def test_a_start_from_an_ended_run_hands_its_stamp_on(tmp_path: Path) -> None:
     async with started(tmp_path) as world:
         before = await parent(world)
-        message = gateway.CloseRun(run=before.run, token=before.capability, reason="agent_stopped", agent={})
-        closed = Requested(keys.gateway_key("c", before.run, "close"), message)
-        assert isinstance(await world.answer(closed), gateway.RunClosed)
+        await close(world, before, {})
         child = await parent(world, key="child", start=Start(run=before.run, submit_index=0, tree=TREE))
         assert start_of(world, child).parent_scored
         # The child is open: no result of its own chose the place, but one of its parent's did.
         grandchild = await create(world, "grandchild", Start(run=child.run, submit_index=0, tree=TREE))
         assert start_of(world, grandchild).parent_scored
+
+
+TOLD: tuple[tuple[dict[str, Any], tuple[str, str]], ...] = (
+    ({"jail": "bwrap", "agent.model_use": {"metering": "relay"}}, ("bwrap", "relay")),
+    ({"jail": "none", "agent.model_use": None, "agent.model_string": "m"}, ("none", "unknown")),
+    (
+        {"jail": "bwrap, open network", "agent.model_use": {"metering": "agent"}},
+        ("bwrap, open network", "agent"),
+    ),
+    ({"jail": "bwrap"}, ("bwrap", "nothing")),
+    ({"jail": ["bwrap"], "agent.model_use": {"metering": 7}}, ("unknown", "unknown")),
+    ({"jail": "bwrap as ever", "agent.model_use": "relay"}, ("unknown", "nothing")),
+    ({}, ("unknown", "nothing")),
+)
+
+
+@pytest.mark.parametrize("told", range(len(TOLD)))
+async def test_a_start_hands_on_the_weakest_conditions_of_its_line(tmp_path: Path, told: int) -> None:
+    """Attack: an agent without a jail plays a run, and a jailed one submits its policy in a run that starts from
+    it. Defence: the coordinator stamps the start with the conditions that gateways told at the ends of the runs
+    before, whatever else they tell."""
+    record, (jail, metering) = TOLD[told]
+    async with started(tmp_path) as world:
+        before = await parent(world, sandbox_tier="landlock")
+        forged = Line(jail="bwrap", sandbox_tier="bwrap", metering="nothing")
+        start = Start(run=before.run, submit_index=0, tree=TREE, line=forged)
+        early = await create(world, "early", start)
+        assert start_of(world, early).line == Line(sandbox_tier="landlock")
+        await close(world, before, {"record": record})
+        child = await parent(world, key="child", start=start)
+        line = Line(jail=jail, sandbox_tier="landlock", metering=metering)
+        assert start_of(world, child).line == line
+        await close(world, child, {"record": TOLD[0][0]})
+        grandchild = await create(world, "grandchild", Start(run=child.run, submit_index=0, tree=TREE))
+        weaker = "relay" if metering == "nothing" else metering
+        assert start_of(world, grandchild).line == msgspec.structs.replace(line, metering=weaker)
+
+
+async def close(world: World, created: Any, agent: dict[str, Any]) -> None:
+    message = gateway.CloseRun(run=created.run, token=created.capability, reason="agent_stopped", agent=agent)
+    closed = Requested(keys.gateway_key("c", created.run, "close"), message)
+    assert isinstance(await world.answer(closed), gateway.RunClosed)
 
 
 async def test_parent_and_start_are_related_when_each_has_its_own_hidden_cases(tmp_path: Path) -> None:
