@@ -271,7 +271,7 @@ def _play(plans: list[Plan], where: Cluster, parallel: int, as_json: bool, *, we
     try:
         played = run_to_end(plain_runs.play(plans, where, parallel, console))
     except KeyboardInterrupt:
-        fail("interrupted; runs that had begun are cancelled and cannot be resumed", 130)
+        fail("interrupted; runs whose agent was at work are cancelled and cannot be resumed", 130)
     if as_json:
         say_json(plain_runs.documents(played))
     else:

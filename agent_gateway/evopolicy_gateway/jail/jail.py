@@ -15,7 +15,7 @@ import msgspec
 
 from evopolicy_gateway.jail.installs import needs_of
 from evopolicy_gateway.jail.proxy import JailProxy
-from evopolicy_gateway.jail.settings import HTTPS, JailSettings, absolute, host
+from evopolicy_gateway.jail.settings import HTTPS, JailSettings, absolute, host, without_proxy
 from evopolicy_gateway.jail.syscalls import filter_program
 from evopolicy_gateway.jail.view import ENTRY, View
 
@@ -189,7 +189,7 @@ class Jail:
         passed = [name for name in surroundings if name in self._variables or name.startswith("LC_")]
         kept = {name: surroundings[name] for name in passed} | {"HOME": self._home, "TMPDIR": "/tmp", **ours}
         if self._open_network:
-            return kept
+            return kept | without_proxy(ours, kept)
         proxy = f"http://127.0.0.1:{self._proxy_port}"
         here = ",".join(_LOOPBACK_NAMES)
         return kept | {

@@ -6,9 +6,10 @@ import os
 import re
 import shutil
 import subprocess
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, get_args
+from urllib.parse import urlsplit
 
 import msgspec
 
@@ -143,3 +144,12 @@ def _check_path(option: str, path: Path) -> None:
         raise ConfigError(f"{option} /: this would bind the whole machine; use --jail none instead")
     if STATE in real.parts or any(next(real.glob(pattern), None) for pattern in _STATE_FOLDERS):
         raise ConfigError(f"{option} {path}: it holds the credentials of a run that is open")
+
+
+def without_proxy(urls: Mapping[str, str], known: Mapping[str, str]) -> dict[str, str]:
+    """`NO_PROXY` and `no_proxy` with the hosts of the URLs, after the value in `known` variables."""
+    value = known.get("no_proxy") or known.get("NO_PROXY") or ""
+    hosts = dict.fromkeys(filter(None, (urlsplit(url).hostname for url in urls.values())))
+    if value.strip() != "*":  # which programs understand alone
+        value = ",".join(filter(None, (value, *hosts)))
+    return dict.fromkeys(("NO_PROXY", "no_proxy"), value)

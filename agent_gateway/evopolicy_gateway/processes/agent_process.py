@@ -11,6 +11,7 @@ from pathlib import Path
 
 from evopolicy_common.processes.child_process import ignore_broken_stdin
 from evopolicy_common.processes.parent_death import ending_with_parent
+from evopolicy_gateway.jail.settings import without_proxy
 from evopolicy_gateway.processes.agent_log import MAX_LINE_BYTES, AgentLog
 
 _CHUNK = 64 << 10
@@ -123,6 +124,6 @@ async def _lines(stream: asyncio.StreamReader) -> AsyncIterator[bytes]:
 
 
 def environment_of(urls: Mapping[str, str]) -> dict[str, str]:
-    """The operator's variables except this project's own, plus the URLs."""
+    """The operator's variables except this project's own, plus the URLs, to which no proxy leads."""
     kept = {name: value for name, value in os.environ.items() if not name.startswith("EVOPOLICY")}
-    return kept | dict(urls)
+    return kept | dict(urls) | without_proxy(urls, kept)

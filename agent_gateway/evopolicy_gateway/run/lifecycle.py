@@ -26,6 +26,7 @@ import contextlib
 import os
 import uuid
 from collections.abc import Callable
+from typing import Literal
 
 import msgspec
 
@@ -53,6 +54,8 @@ from evopolicy_gateway.run_folder.layout import save, saved
 from evopolicy_gateway.run_folder.listener import agent_place
 from evopolicy_gateway.run_folder.locks import alone
 
+Leaves = Literal["nothing", "ended", "all"]
+"""The runs that a cancelled command leaves to be resumed: `ended`, those whose agent has ended."""
 GIVE_UP_TIMEOUT_S = 10.0
 """Limit for reporting a given-up run to the coordinator, whose failure may be the reason for giving up."""
 
@@ -67,12 +70,12 @@ class RunLifecycle:
         gateway: Credentials,
         watch: View,
         *,
-        stays_open: bool = False,
+        leaves: Leaves = "nothing",
         on_agent_gone: Callable[[], None] = lambda: None,
     ) -> None:
         """`gateway`: credentials of the gateway role, without a run's capability.
 
-        `stays_open`: cancelling this leaves the run open, to be resumed. `on_agent_gone` is called once the
+        `leaves`: whether cancelling this leaves the run to be resumed. `on_agent_gone` is called once the
         agent's side is over; the rest of the run needs no slot for an agent.
         """
         self._plan = plan
@@ -80,7 +83,7 @@ class RunLifecycle:
         self._operations = operations
         self._credentials = gateway
         self._watch = watch
-        self._stays_open = stays_open
+        self._leaves = leaves
         self._on_agent_gone = on_agent_gone
         self.run = ""
         """The cluster's id of the run, once it is open."""
@@ -269,10 +272,12 @@ class RunLifecycle:
             self._note(
                 f"when they are gone, continue with --resume, or run: evopolicy runs agent-gone {self.run}"
             )
-        elif self._finished is not None or (side.closed and isinstance(error, Exception)):
+        elif self._finished is not None or (
+            side.closed and (self._leaves != "nothing" or isinstance(error, Exception))
+        ):
             how = f"--resume --exp-id {self._plan.settings.exp_id}, or the suite's command again,"
             self._note(f"its agent has ended: {how} completes the run without starting it")
-        elif self._stays_open and isinstance(error, asyncio.CancelledError):
+        elif self._leaves == "all" and isinstance(error, asyncio.CancelledError):
             await self._tell_gone()
         else:
             await self._give_up(str(error) if isinstance(error, EvopolicyError) else None)

@@ -55,7 +55,7 @@ _ID_LENGTH = 64
 class ClaimedSweep(Sweep):
     """Plays a suite's decisions together with the other hosts of the sweep."""
 
-    stays_open = True
+    leaves = "all"
 
     def __init__(self, suite: SuiteFile, root: Path, index: Index, *known: Any) -> None:
         """`known`: the further arguments of `Sweep`; its view is a `SuiteView`."""

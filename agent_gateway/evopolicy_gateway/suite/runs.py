@@ -17,6 +17,7 @@ from evopolicy_common.records.suite_folder import Entry, Index
 from evopolicy_common.records.words import in_words
 from evopolicy_common.terminal import number
 from evopolicy_gateway.operator.cluster import Cluster, connected
+from evopolicy_gateway.run.lifecycle import Leaves
 from evopolicy_gateway.run.plan import Plan
 from evopolicy_gateway.run.watch import RunView
 from evopolicy_gateway.suite.decisions import Decision
@@ -41,11 +42,10 @@ class PlayedRuns(msgspec.Struct, frozen=True):
 
 
 class _Runs(Sweep):
-    stays_open = False
-
-    def __init__(self, played: PlayedRuns, parallel: int, *known: Any) -> None:
+    def __init__(self, played: PlayedRuns, parallel: int, leaves: Leaves, *known: Any) -> None:
         """`known`: the further arguments of `Sweep`."""
         super().__init__(Parallel(machine=parallel), played.index, *known)
+        self.leaves = leaves
         self._results = played
 
     async def _record(self, decision: Decision, begun: Entry) -> Entry:
@@ -76,7 +76,9 @@ async def play(plans: Sequence[Plan], where: Cluster, parallel: int, console: Te
         where.check_cases(settings)
         wanted = [one.env for one in settings], {one.sandbox_tier for one in settings}
         async with connected(where, *wanted) as (operations, gateway, failed):
-            runs = _Runs(played, parallel, operations, gateway, watch)
+            # A temporary cluster takes its runs with it.
+            leaves: Leaves = "nothing" if where.local is not None and where.local.state is None else "ended"
+            runs = _Runs(played, parallel, leaves, operations, gateway, watch)
             await unless_failed(asyncio.create_task(runs.play(decided)), failed)
     if played.wrong == set(played.index.runs):
         raise ConfigError(played.index.runs[plans[0].name].error or "")

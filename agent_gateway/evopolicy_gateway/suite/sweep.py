@@ -2,7 +2,7 @@
 
 - A failed run does not stop the others.
 - A run occupies a place (`parallel`) until its agent is gone: the next one starts while it is scored.
-- Cancelled, the sweep cancels its runs, or leaves them open if they can be resumed (`stays_open`).
+- Cancelled, the sweep cancels its runs, or leaves those that can be resumed (`leaves`).
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import msgspec
 from evopolicy_common.records.run_record import RunRecord
 from evopolicy_common.records.suite_folder import Entry, Index
 from evopolicy_common.wire.credentials import Credentials
-from evopolicy_gateway.run.lifecycle import RunLifecycle
+from evopolicy_gateway.run.lifecycle import Leaves, RunLifecycle
 from evopolicy_gateway.run.operations import Operations
 from evopolicy_gateway.run.plan import Plan
 from evopolicy_gateway.run.record import why_failed
@@ -39,8 +39,8 @@ FINISH_AGAIN_S = (1.0, 5.0, 30.0)
 class Sweep(ABC):
     """Plays the decisions."""
 
-    stays_open: bool
-    """Whether cancelling this leaves its runs open, to be resumed."""
+    leaves: Leaves
+    """Which of its runs cancelling this leaves to be resumed."""
 
     def __init__(
         self, limits: Parallel, index: Index, operations: Operations, gateway: Credentials, watch: View
@@ -187,6 +187,6 @@ class Sweep(ABC):
     ) -> RunRecord:
         known = (plan, self._operations, self._gateway, self._watch)
         gone = partial(self._agent_gone, plan.name)
-        play = RunLifecycle(*known, stays_open=self.stays_open, on_agent_gone=gone)
+        play = RunLifecycle(*known, leaves=self.leaves, on_agent_gone=gone)
         self._plays[plan.name] = play
         return await (play.go_on() if decision.kind in ("resume", "finish") else play.play(put_aside))

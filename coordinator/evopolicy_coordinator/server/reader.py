@@ -74,6 +74,8 @@ class ServiceReader:
     def __init__(self, database: Path, blobs: BlobStore, uploads: Uploads) -> None:
         self.state = database.parent
         """The state folder."""
+        self.storage_error = ""
+        """Why the last chunk of a blob could not be written; empty: it was."""
         self._database = database
         self._blobs = blobs
         self._uploads = uploads
@@ -302,8 +304,10 @@ class ServiceReader:
             )
         except StorageError as error:
             if error.__cause__ is not None:  # the disk's fault, not the sender's
+                self.storage_error = str(error)
                 raise
             raise RefusedError(Refusal.BAD_BLOB, str(error)) from error
+        self.storage_error = ""
         return BlobAck(have=have)
 
     def _get(self, run: str | None, message: BlobGet) -> Message:

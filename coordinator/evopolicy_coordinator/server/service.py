@@ -14,7 +14,9 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import errno
 import hmac
+import os
 import time
 from collections.abc import Awaitable, Callable, Coroutine, Iterator
 from importlib import metadata
@@ -66,6 +68,10 @@ _SWEEP_S = _FORGET_S / 4
 _STALLS_LOGGED = 5
 _READ_AGAIN_S = 3.0
 _CANNOT_WRITE = "the coordinator cannot write its store and accepts no changes until it can"
+_FULL = ("is full", os.strerror(errno.ENOSPC), os.strerror(errno.EDQUOT))
+"""Parts of the errors of a full disk, of SQLite and of the system."""
+_ROOM_MB = 64
+"""What a coordinator without large episodes writes in a run, its log ahead of the database included."""
 
 
 class Pending(NamedTuple):
@@ -415,7 +421,13 @@ class Service:
 
     @property
     def _trouble(self) -> str:
-        return f"{_CANNOT_WRITE}: {self.host.storage_error}" if self.host.storage_error else ""
+        why = self.host.storage_error or self._reader.storage_error
+        if not why:
+            return ""
+        remedy = f"see that {self._reader.state} can be written"
+        if any(text in why for text in _FULL):
+            remedy = f"make room in {self._reader.state}, {_ROOM_MB} MB or more (df -h, evopolicy gc)"
+        return f"{_CANNOT_WRITE}: {why}; {remedy}. Runs continue by themselves then"
 
     def _stimulus_of(self, message: Message) -> str:
         return self._stimulus(type(message).__name__.lower())
@@ -457,6 +469,8 @@ class Service:
                 self._reader.read(effect, answer)
                 return
             reply = message(effect, self._reader.state)
+            if isinstance(reply, operator.RunProgress):
+                reply = replace(reply, trouble=self._trouble)
             self._refused_workers.answered(query.key, query.payload, reply, self.host.now())
             answer(reply)
         elif isinstance(effect, Log):

@@ -7,6 +7,7 @@ Each part is scaled down where it is wider or higher than its place (adjustbox).
 
 from __future__ import annotations
 
+import itertools
 import re
 import unicodedata
 from collections.abc import Sequence
@@ -68,8 +69,23 @@ _ACCENTED = frozenset(map(chr, range(0xC0, 0x100))) - set("×÷ÐÞðþ")
 
 
 def latex_text(text: str) -> str:
-    """Escapes `text`: no LaTeX commands, no ligatures of dashes; unknown letters become `?`."""
-    return "".join(map(_character, re.sub("-(?=-)", "-" + _JOINER, " ".join(text.split()))))
+    """Escapes `text`: no LaTeX commands, no ligatures of dashes; letters as `_spelt` gives them, control characters
+    become `?`."""
+    return "".join(map(_character, re.sub("-(?=-)", "-" + _JOINER, " ".join(_spelt(text).split()))))
+
+
+def _spelt(text: str) -> str:
+    """`text` with code points in place of what pdfLaTeX cannot set, such as Arabic letters and emoji: names stay
+    distinct."""
+    groups = itertools.groupby(unicodedata.normalize("NFC", text), _is_unknown)
+    return "".join(
+        "-".join(f"U+{ord(one):04X}" for one in group) if unknown else "".join(group)
+        for unknown, group in groups
+    )
+
+
+def _is_unknown(character: str) -> bool:
+    return _character(character) == "?" != character and unicodedata.category(character) not in ("Cc", "Cs")
 
 
 def _character(character: str) -> str:
@@ -131,7 +147,7 @@ def to_latex(table: Table) -> str:
 
 
 def _column(table: Table, column: Column) -> _Column:
-    texts = [shown(row.get(column.key), column) for row in table.rows]
+    texts = [_spelt(shown(row.get(column.key), column)) for row in table.rows]
     is_long = column.kind == "text" and max(map(len, texts), default=0) > _LONG
     cells = [
         _MARKED[table.marks.get((number, column.key), 0)].format(_cell(text, column, is_long))

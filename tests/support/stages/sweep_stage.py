@@ -95,12 +95,12 @@ class Lifecycle:
         gateway: object,
         watch: object,
         *,
-        stays_open: bool,
+        leaves: str,
         on_agent_gone: Callable[[], None],
     ) -> None:
         self.plan, self.name, self.agent_at_work = plan, plan.name, True
         self.run = f"run of {plan.name}"
-        self.stays_open, self.on_agent_gone = stays_open, on_agent_gone
+        self.leaves, self.on_agent_gone = leaves, on_agent_gone
 
 
 class Stage:
@@ -132,7 +132,7 @@ class Stage:
 
         class Play(Lifecycle):
             async def play(self, put_aside: Callable[[], None] | None = None) -> RunRecord:
-                assert self.stays_open
+                assert self.leaves == "all"
                 if put_aside is not None:
                     put_aside()
                 stage.begun.append(self.name)
@@ -199,7 +199,7 @@ class Direct:
 
         class Play(Lifecycle):
             async def play(self, put_aside: object = None, kind: str = "play") -> RunRecord:
-                assert not self.stays_open
+                assert self.leaves == "ended"
                 assert put_aside is None
                 stage.kinds.append(kind)
                 try:

@@ -50,7 +50,9 @@ def test_a_negative_number_has_a_true_minus() -> None:
     [
         ("0 … 1, −2 ≤ x", r"0 \ldots{} 1, $-$2 $\le$ x"),
         ("--model a---b", "-{}-model a-{}-{}-b"),
-        ("é ﬁ 中\x00", "é fi ??"),
+        ("é ﬁ 中\x00", "é fi U+4E2D?"),
+        ("cafe\N{COMBINING ACUTE ACCENT} مثال", "café U+0645-U+062B-U+0627-U+0644"),
+        ("fast 🚀", "fast U+1F680"),
         (" two\n lines ", "two lines"),
         ("\\input{/etc/passwd}", r"\textbackslash{}input\{/etc/passwd\}"),
     ],
@@ -88,6 +90,16 @@ def test_long_texts_are_broken_into_lines_and_numbers_never() -> None:
 def test_a_long_name_may_be_broken_where_it_has_joints() -> None:
     text = to_latex(table(4, 6, 2, "gymnasium/MiniGrid-ObstructedMaze-1Q-v1"))
     assert "gymnasium/\\allowbreak{}MiniGrid-\\allowbreak{}ObstructedMaze-" in text
+
+
+def test_entries_of_other_scripts_stay_apart_within_the_page() -> None:
+    names = ("模型甲", "模型乙", "مثال", "🚀", "🛸")
+    columns = (Column("who", "Agent"), *(Column(f"x{i}", "Number", "number") for i in range(6)))
+    rows = tuple({"who": name, **{f"x{i}": 1.5 for i in range(6)}} for name in names)
+    text = to_latex(Table(name="n", title="N", caption="", columns=columns, rows=rows))
+    shown = [line.partition(" & ")[0] for line in text.splitlines() if " & 1.500" in line]
+    assert len({name.replace("\\allowbreak{}", "") for name in shown}) == len(names)
+    assert not any("?" in name for name in shown)
 
 
 def test_a_table_too_long_goes_on_in_further_floats_under_its_heading() -> None:

@@ -68,6 +68,22 @@ def test_video_all_leaves_a_video_beside_each_trajectory(tmp_path: Path) -> None
         assert (folder / "video.mp4").read_bytes()[4:8] == b"ftyp"
 
 
+@pytest.mark.parametrize(
+    "jail", ["--jail none", "--jail open-network --jail-env http_proxy", "--jail-env http_proxy"]
+)
+def test_the_operators_proxy_is_not_used_for_submits(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, jail: str
+) -> None:
+    """In each mode of the jail, with a proxy that answers nobody."""
+    monkeypatch.setenv("http_proxy", "http://127.0.0.1:9")
+    monkeypatch.setenv("NO_PROXY", "intranet.example")
+    one = agent(tmp_path, "assert 'summary' in submit([0, 1, 2, 3, 4, 5])\nprint(os.environ['no_proxy'])")
+    ended(tmp_path, "local", "--env", "toy/line", "--agent", one, "--exp-id", "t", *jail.split(), *SMALL)
+    assert record_in(run_dir(tmp_path)).outcome.budget_used == 6
+    shown = (run_dir(tmp_path) / "logs" / "agent.jsonl").read_text()
+    assert ("intranet.example,127.0.0.1" in shown) == (jail == "--jail none")
+
+
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_an_interrupted_local_command_takes_everything_down(tmp_path: Path, number: signal.Signals) -> None:
     waits = agent(tmp_path, "submit([0])\nopen('here', 'w')\ntime.sleep(1000)")
@@ -79,7 +95,7 @@ def test_an_interrupted_local_command_takes_everything_down(tmp_path: Path, numb
         assert code == 130
         assert (
             err.splitlines()[-1]
-            == "error: interrupted; runs that had begun are cancelled and cannot be resumed"
+            == "error: interrupted; runs whose agent was at work are cancelled and cannot be resumed"
         )
         assert "Traceback" not in err
         assert running.alive() == []
