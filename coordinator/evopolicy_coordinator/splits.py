@@ -59,6 +59,8 @@ class EnvironmentSplits(msgspec.Struct, frozen=True, kw_only=True):
     """Public name of the cases' origin: the secret, or the files."""
     files: dict[str, str] = {}
     """SHA-256 (hex) of the bytes of the files that the cases come from, by file name."""
+    trials: str = ""
+    """SHA-256 (hex) of the trials of candidates that chose a world's rules; empty without any."""
 
     def cases(self, split: Split) -> tuple[Case, ...]:
         """The cases of `split`, in order of their ids."""
@@ -175,9 +177,9 @@ def load(folder: Path) -> tuple[EnvironmentSplits | None, list[str]]:
     for split, content in contents.items():
         faults += _file_faults(folder, split, content, env)
     secret = all(content.secret is True for content in contents.values())
-    return EnvironmentSplits(env=env, secret=secret, epoch="", files=hashes, **cases), faults + overlaps(
-        cases
-    )
+    return EnvironmentSplits(
+        env=env, secret=secret, epoch="", files=hashes, trials="", **cases
+    ), faults + overlaps(cases)
 
 
 def _file_faults(folder: Path, split: Split, content: SplitFile, env: str) -> list[str]:
@@ -223,8 +225,10 @@ class SplitSource:
                 key = hmac.digest(self._secret, f"hidden cases of run {own}".encode(), "sha256")
                 shared = {case.seed for members in cases.values() for case in members}
                 cases = {**derive(key, suite, env, counts, shared), "train": cases["train"]}
-            cases = in_world(env, self._key(env), cases)
-            return EnvironmentSplits(env=env, secret=True, epoch=epoch_of(self._secret), files={}, **cases)
+            key, trials = self._key(env)
+            cases = in_world(env, key, cases)
+            epoch = epoch_of(self._secret)
+            return EnvironmentSplits(env=env, secret=True, epoch=epoch, files={}, trials=trials, **cases)
         if own:
             raise ConfigError(
                 "--set hidden_cases=per-run needs cases that are derived from the coordinator's secret; this one takes"
@@ -254,7 +258,9 @@ class SplitSource:
                 )
         cut = {split: splits.cases(split)[: counts.get(split)] for split in SPLITS}
         epoch = f"files-{cases_hash((*splits.validation, *splits.heldout))[:16]}"
-        return EnvironmentSplits(env=env, secret=splits.secret, epoch=epoch, files=splits.files, **cut)
+        return EnvironmentSplits(
+            env=env, secret=splits.secret, epoch=epoch, files=splits.files, trials="", **cut
+        )
 
     def further(self, suite: str, env: str, name: str, n: int, taken: Sequence[Case]) -> FurtherCases:
         """`n` further hidden cases, equal for equal `name`, without `taken`. Raises ConfigError with
@@ -266,10 +272,12 @@ class SplitSource:
             )
         key = hmac.digest(self._secret, f"further hidden cases {name}".encode(), "sha256")
         cases = derive(key, suite, env, {"heldout": n}, (case.seed for case in taken))
-        cases = in_world(env, self._key(env), cases)
+        cases = in_world(env, self._key(env)[0], cases)
         return FurtherCases(cases=cases["heldout"], epoch=epoch_of(self._secret))
 
-    def _key(self, env: str) -> str:
+    def _key(self, env: str) -> tuple[str, str]:
+        """The key of a world, and the digest of the trials that chose it; both empty for any other environment."""
         if unchanged(env) == env:
-            return ""
-        return worlds.key_of(self._secret, env, worlds.number_of(env, self._secret, self._journal))
+            return "", ""
+        number, trials = worlds.number_of(env, self._secret, self._journal)
+        return worlds.key_of(self._secret, env, number), trials

@@ -20,15 +20,15 @@ from pathlib import Path
 
 import msgspec
 
-from evopolicy_common.catalogue.worlds import ids, unchanged
+from evopolicy_common.catalogue.worlds import CANDIDATES, ids, unchanged
 from evopolicy_common.errors import DECODE_ERRORS, ConfigError
 from evopolicy_common.records.blobs import write_atomically
-from evopolicy_common.records.journal import epoch_of
+from evopolicy_common.records.journal import digest, epoch_of
 
 JOURNAL = "worlds.jsonl"
 """Name of the journal in a state folder."""
-CASES, CANDIDATES, VARIANTS = 8, 16, 8
-"""Cases of each evaluation, most candidates of an environment, and variants of the policy in a search."""
+CASES, VARIANTS = 8, 8
+"""Cases of each evaluation, and variants of the policy in a search."""
 LOSS, REACH = 0.5, 0.8
 """Of the distance from random to the canonical policy."""
 
@@ -87,21 +87,27 @@ def key_of(secret: bytes, env: str, number: int) -> str:
     return f"{root}-{number}"
 
 
-def number_of(env: str, secret: bytes, journal: Path | None) -> int:
-    """The candidate that a world of this epoch has. Raises ConfigError if its environment's candidates were
-    tried and too few were accepted."""
+def number_of(env: str, secret: bytes, journal: Path | None) -> tuple[int, str]:
+    """The candidate that a world of this epoch has, and the digest (SHA-256, hex) of the trials that chose it; empty
+    without any. Raises ConfigError if too few were accepted, or the trials are not those of `accept-worlds`."""
     place = ids(unchanged(env)).index(env)
     tried = [] if journal is None else of_environment(read(journal), epoch_of(secret), unchanged(env))
     if not tried:
-        return place
-    accepted = [each.number for each in tried if isinstance(each, Candidate) and each.accepted]
+        return place, ""
+    candidates = [each for each in tried if isinstance(each, Candidate)]
+    if [each.number for each in candidates] != list(range(min(len(candidates), CANDIDATES))):
+        raise ConfigError(
+            f"{journal}: the candidates of {unchanged(env)} are not 0 to {CANDIDATES - 1} in order, as"
+            " `evopolicy-coordinator accept-worlds` tries them: restore the journal from a backup"
+        )
+    accepted = [each.number for each in candidates if each.accepted]
     if place >= len(accepted):
         raise ConfigError(
             f"{env} has no accepted rules in this epoch: {len(tried) - 1} candidates were tried and"
             f" {len(accepted)} accepted; repeat `evopolicy-coordinator accept-worlds` if it was interrupted, or"
             " leave this world out"
         )
-    return accepted[place]
+    return accepted[place], digest(b"".join(msgspec.json.encode(each) + b"\n" for each in tried))
 
 
 def of_environment(entries: list[Entry], epoch: str, env: str) -> list[Entry]:

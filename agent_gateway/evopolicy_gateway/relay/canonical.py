@@ -7,6 +7,7 @@ texts. docs/how-to/replay-an-agent.md lists both.
 from __future__ import annotations
 
 import difflib
+import itertools
 import json
 import re
 from typing import Any
@@ -82,6 +83,8 @@ TEXTS: tuple[tuple[str, re.Pattern[bytes], bytes], ...] = (
 """Patterns in the request's JSON, with what takes their place, after random ids (UUIDs)."""
 _HAS_ID, _IDS = re.compile(_ID), re.compile(rb"[0-9a-f]{8}" + _ID)
 MAX_LINES = 60
+_CONTEXT = 2
+"""Equal lines beside a difference."""
 
 
 def canonical(api: str, body: bytes) -> bytes:
@@ -113,11 +116,18 @@ def _remove(value: Any, path: list[str]) -> None:
 
 
 def difference(recorded: Any, now: Any) -> str:
-    """How two canonical requests differ, in lines of a unified diff, at most `MAX_LINES`."""
+    """How two canonical requests differ from the first difference on, in at most `MAX_LINES` lines of a unified diff.
+
+    Compares no more lines than are shown: a diff takes quadratic time, and an agent writes the texts.
+    """
     ours, theirs = (
         json.dumps(each, indent=1, ensure_ascii=False, sort_keys=True).replace("\\n", "\n").split("\n")
         for each in (recorded, now)
     )
-    lines = list(difflib.unified_diff(ours, theirs, "recorded", "now", n=2, lineterm=""))
-    cut = [f"… {len(lines) - MAX_LINES:,} more lines"] if len(lines) > MAX_LINES else []
-    return "\n".join([line[:400] for line in lines[:MAX_LINES]] + cut)
+    pairs = enumerate(itertools.zip_longest(ours, theirs))
+    first = max(0, next((n for n, (one, other) in pairs if one != other), 0) - _CONTEXT)
+    shown = (side[first : first + MAX_LINES] for side in (ours, theirs))
+    names = (f"{side}, from line {first + 1:,}" for side in ("recorded", "now"))
+    lines = [line[:400] for line in difflib.unified_diff(*shown, *names, n=_CONTEXT, lineterm="")]
+    left = max(len(ours), len(theirs)) - first - MAX_LINES
+    return "\n".join(lines[:MAX_LINES] + [f"… {left:,} more lines"] * (left > 0))

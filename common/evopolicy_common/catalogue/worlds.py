@@ -9,11 +9,19 @@ import re
 
 N_WORLDS = 3
 """Worlds of each environment that has some."""
+CANDIDATES = 16
+"""Most candidates that are tried for an environment's worlds."""
 OPTION = "world"
 """The key's name in a case's options."""
 KEY = re.compile("[0-9a-f]{32}(-[0-9]{1,4})?")
 """The root of an environment's candidates, and which of them; files may have a key without number."""
 _ID = re.compile(r"(.+)@w([1-9][0-9]*)")
+
+
+def candidate(key: str) -> int | None:
+    """The candidate's number in a key; None for a key without one, and for no key."""
+    _, hyphen, number = key.partition("-")
+    return int(number) if hyphen and KEY.fullmatch(key) else None
 
 
 def unchanged(env_id: str) -> str:

@@ -96,6 +96,8 @@ class Opening(msgspec.Struct, frozen=True, kw_only=True):
     """Whether the hidden cases are unpredictable."""
     allowed_imports: Many[Word]
     denied_imports: Many[Word]
+    trials: Word = ""
+    """SHA-256 (hex) of the trials of candidates that chose a world's rules (STATE/worlds.jsonl); empty without any."""
     policy_seeds: Word
     """SHA-256 (hex) of the secret from which the policies' random seeds derive."""
 

@@ -98,7 +98,7 @@ def _plan(
         }
         derived = splits.derive(secret, suite.name, env, counts)
         is_world = unchanged(env) != env
-        key = worlds.key_of(secret, env, worlds.number_of(env, secret, None)) if is_world else ""
+        key = worlds.key_of(secret, env, worlds.number_of(env, secret, None)[0]) if is_world else ""
         cases_of = splits.in_world(env, key, derived)
         for split, cases in cases_of.items():
             stem = split_files.FILE_STEMS[split]

@@ -19,7 +19,7 @@ import msgspec
 import typer
 
 from evopolicy_common import catalogue
-from evopolicy_common.catalogue.worlds import N_WORLDS, ids, unchanged
+from evopolicy_common.catalogue.worlds import CANDIDATES, N_WORLDS, ids, unchanged
 from evopolicy_common.cli.conventions import State, end_on_sigterm, run_to_end
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.local.cluster import local_cluster, unless_failed
@@ -116,7 +116,7 @@ class _Trials:
                 f"{folder} is not the policy with which this epoch's candidates of {env} are tried"
                 f" ({base.policy[:16] or 'none'}): restore it"
             )
-        while policy and len(tried) < worlds.CANDIDATES and sum(each.accepted for each in tried) < N_WORLDS:
+        while policy and len(tried) < CANDIDATES and sum(each.accepted for each in tried) < N_WORLDS:
             one = await self._candidate(base, policy, len(tried))
             worlds.append(self._journal, one)
             verdict = "accepted" if one.accepted else "rejected"

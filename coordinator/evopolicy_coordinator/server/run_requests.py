@@ -150,6 +150,7 @@ class RunRequests:
             split_hashes=cases.hashes(),
             split_secret=cases.secret,
             epoch=cases.epoch,
+            trials=cases.trials,
             allowed_imports=self.allowed_imports,
             denied_imports=self._denied_imports,
             max_steps=_max_steps(wanted.env, wanted.step_limit),

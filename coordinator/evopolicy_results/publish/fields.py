@@ -24,9 +24,9 @@ from evopolicy_common.records.run_record import Tokens
 from evopolicy_results.publish import contents
 
 Cover = Literal["derived", "committed", "removed", "replayed", "claim"]
-"""`derived`: compared with what follows from other files. `committed`: a journal entry holds a digest of it. `removed`:
-empty in every publication. `replayed`: compared by `--replay`. `claim`: the publisher's word, which nobody can
-check."""
+"""`derived`: compared with what follows from other files. `committed`: a journal entry holds a digest of it; in
+`run.json` it is the publisher's word at the run's end (`TOLD`). `removed`: empty in every publication. `replayed`:
+compared by `--replay`. `claim`: the publisher's word, which nobody can check."""
 
 
 def _all(path: str, kind: type[msgspec.Struct]) -> str:
@@ -75,6 +75,8 @@ _RUN: dict[Cover, str] = {
         rejected_submits.*.at rejected_submits.*.after_submits versions.harness
     """,
 }
+TOLD = tuple(dict.fromkeys(".".join(name.split(".")[:2]) for name in _RUN["committed"].split()))
+"""Fields of `run.json` that only the publisher's programs state. A journal entry fixes them when the run ends."""
 FIELDS: dict[str, dict[Cover, str]] = {
     contents.MANIFEST: {
         "derived": "format version canary journal_entries journal_head files.*",

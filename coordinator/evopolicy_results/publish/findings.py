@@ -37,6 +37,7 @@ KINDS = {
     "checkpoints": "the policies are those that were submitted",
     "logs": "agents' logs are what the agents wrote",
     "card": "the evaluation card and its descriptions follow from the runs",
+    "worlds": "every world has a candidate that the fixed order allows",
     "starts": "every run began with the usual workspace",
     "completeness": "every run that was opened for the entries is here, with the runs that they start from",
     "order": "the journal could not be begun anew",

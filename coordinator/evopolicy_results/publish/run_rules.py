@@ -10,6 +10,7 @@ from typing import Any
 import msgspec
 
 from evopolicy_common import catalogue
+from evopolicy_common.catalogue import worlds
 from evopolicy_common.errors import ProtocolError
 from evopolicy_common.messages.run_settings import Line
 from evopolicy_common.records import journal
@@ -75,6 +76,11 @@ def check_run(files: Files, run: PublishedRun, history: History, damaged: set[st
     _checkpoints(files, run, damaged, checked)
     if f"{run.folder}/{contents.LOG}" in files.names:
         checked.add("logs", "open", "the log is its publisher's: nothing fixed it when the run ended", name)
+    if text := _chosen_world(run):
+        checked.add("worlds", "open", text, name)
+    checked.add(
+        "claims", "open", f"its publisher's word, fixed when it ended: {', '.join(fields.TOLD)}", name
+    )
     text = "a recording shows what was played, not who decided it: actions could have been computed elsewhere"
     checked.add("policies", "open", text, name)
 
@@ -281,6 +287,43 @@ def _scores(run: PublishedRun, history: History) -> Iterator[str]:
             yield "the score is not the mean return of all held-out cases"
 
 
+def _worlds(run: PublishedRun, history: History) -> Iterator[str]:
+    """The rules of a world have a candidate that `accept-worlds` tries, and the n-th world at least the n-th."""
+    env, opening = run.opening.settings.env, run.opening
+    if worlds.unchanged(env) == env:
+        return
+    keys = {str((case.options or {}).get(worlds.OPTION, "")) for split in SPLITS for case in run.cases(split)}
+    key = min(keys, default="")
+    if len(keys) > 1 or not worlds.KEY.fullmatch(key):
+        yield f"the cases of {env} have other keys of a world"
+    elif (number := worlds.candidate(key)) is not None:
+        least = worlds.ids(worlds.unchanged(env)).index(env)
+        most = worlds.CANDIDATES - 1 if opening.trials else least
+        if not least <= number <= most:
+            how = "its trials allow" if opening.trials else "without trials it has"
+            yield f"{env} has candidate {number}; {how} {least}" + (f" to {most}" if most > least else "")
+
+
+def _chosen_world(run: PublishedRun) -> str:
+    """What nobody can check of a run's world; empty for no world."""
+    env, opening = run.opening.settings.env, run.opening
+    if worlds.unchanged(env) == env:
+        return ""
+    number = (
+        worlds.candidate(str((opening.train[0].options or {}).get(worlds.OPTION, "")))
+        if opening.train
+        else None
+    )
+    if number is None:
+        return f"{env} has rules of its publisher's choice, from case files"
+    how = (
+        f"its publisher's trials chose it (SHA-256 {opening.trials})"
+        if opening.trials
+        else "it was not tried"
+    )
+    return f"{env} has candidate {number} of {worlds.CANDIDATES}: {how}"
+
+
 _RULES: dict[str, Callable[[PublishedRun, History], Iterator[str | Fault]]] = {
     "commitment": _commitment,
     "disclosure": _disclosure,
@@ -289,6 +332,7 @@ _RULES: dict[str, Callable[[PublishedRun, History], Iterator[str | Fault]]] = {
     "budget": _budget,
     "selection": _selection,
     "scores": _scores,
+    "worlds": _worlds,
 }
 """By the kind of their findings; a `Fault` is of another kind."""
 

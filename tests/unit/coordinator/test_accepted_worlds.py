@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from evopolicy_common.errors import ConfigError
-from evopolicy_common.records.journal import epoch_of
+from evopolicy_common.records.journal import digest, epoch_of
 from evopolicy_coordinator import worlds
 from evopolicy_coordinator.splits import SplitSource
 
@@ -76,6 +76,35 @@ def test_an_environment_without_a_known_policy_has_no_world(tmp_path: Path) -> N
     worlds.append(journal, worlds.Base(epoch=BASE.epoch, env=BASE.env, policy=""))
     with pytest.raises(ConfigError, match="no accepted rules"):
         worlds.number_of("gym/acrobot@w1", SECRET, journal)
+
+
+@pytest.mark.parametrize("numbers", [[977], [0, 2], [1, 0], [*range(17)], [0, 0]])
+def test_trials_out_of_their_order_are_refused(tmp_path: Path, numbers: list[int]) -> None:
+    """Attack: an operator writes the trials by hand, to choose rules freely. Defence: they are candidates 0 to 15 in
+    order, and a run commits to their digest."""
+    journal = tmp_path / worlds.JOURNAL
+    worlds.append(journal, BASE)
+    for number in numbers:
+        worlds.append(journal, candidate(number, accepted=True))
+    with pytest.raises(ConfigError, match="are not 0 to 15 in order"):
+        worlds.number_of("gym/acrobot@w1", SECRET, journal)
+
+
+def test_cases_of_a_world_come_with_the_digest_of_its_trials(tmp_path: Path) -> None:
+    journal = tmp_path / worlds.JOURNAL
+    source = SplitSource(data=None, secret=SECRET, journal=journal)
+
+    def trials(env: str = "gym/acrobot@w1") -> str:
+        return source.splits("core16-worlds", env, COUNTS).trials
+
+    assert trials() == trials("gym/acrobot") == ""
+    worlds.append(journal, BASE)
+    worlds.append(journal, candidate(0, accepted=True))
+    first = trials()
+    assert first == digest(journal.read_bytes())
+    worlds.append(journal, candidate(1, accepted=False))
+    assert trials() == digest(journal.read_bytes()) != first
+    assert trials("gym/acrobot") == ""
 
 
 def test_candidates_of_one_environment_share_a_root() -> None:

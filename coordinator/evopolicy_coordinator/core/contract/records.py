@@ -61,6 +61,8 @@ class RunRow(msgspec.Struct, frozen=True, kw_only=True, tag="run"):
     """The random reference's actions follow from split and case; if False (rows of earlier versions), from `secret`."""
     epoch: str = ""
     """Of the cases; empty in rows of earlier versions."""
+    trials: str = ""
+    """As in `journal.Opening`."""
     salt: bytes = b""
     """32 random bytes; of the commitment."""
     committed: Committed | None = None

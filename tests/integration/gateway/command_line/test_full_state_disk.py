@@ -76,6 +76,8 @@ def disk(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.Mon
         subprocess.run(["umount", "--lazy", place], check=True)
 
 
+@pytest.mark.slow
+@pytest.mark.timeout(600)
 @pytest.mark.parametrize("interrupted", [False, True])
 def test_a_full_state_disk_after_the_budget_costs_no_run(
     tmp_path: Path, disk: Disk, interrupted: bool

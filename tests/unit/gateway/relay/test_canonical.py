@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
 from typing import Any
 
 import pytest
 
+from evopolicy_gateway.relay import canonical as canonical_module
 from evopolicy_gateway.relay.canonical import MAX_LINES, canonical, difference
 
 
@@ -91,3 +93,23 @@ def test_a_difference_is_short_and_names_both_sides() -> None:
     assert any(line.startswith("-b") for line in shown)
     assert any(line.startswith("+c") for line in shown)
     assert len(shown) == MAX_LINES + 1
+
+
+def test_a_difference_is_sought_in_no_more_lines_than_are_shown(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Attack: an agent whose long requests differ in every line keeps a replay's diff, which is quadratic, busy for
+    hours. Defence: it compares what it shows."""
+    compared: list[int] = []
+    known = canonical_module.difflib.unified_diff
+
+    def counted(ours: list[str], theirs: list[str], *more: str, **named: Any) -> Iterator[str]:
+        compared.extend([len(ours), len(theirs)])
+        return known(ours, theirs, *more, **named)
+
+    monkeypatch.setattr(canonical_module.difflib, "unified_diff", counted)
+    same = "same\n" * 5000
+    texts = (same + "".join(f"{sign}{n % 7}\n" for n in range(50_000)) for sign in "ab")
+    shown = difference(*map(said, texts)).splitlines()
+    assert max(compared) <= MAX_LINES
+    assert "from line 5,0" in shown[0]
+    assert any(line.startswith("-a") for line in shown)
+    assert any(line.startswith("+b") for line in shown)
