@@ -20,6 +20,7 @@ import msgspec
 from invented.simulated_entries import (
     CASE_SHAPES,
     RUN_SHAPES,
+    SOLVED,
     Rate,
     World,
     aggregate_rates,
@@ -56,6 +57,7 @@ class Claim(msgspec.Struct, frozen=True, kw_only=True):
 
 CASES = (5, 8, 16, 32, 64, 256)
 RUNS = (2, 3, 5, 10, 16)
+SOLVED_RUNS = (2, 3, 4, 5, 7, 10, 16)
 
 
 def _gaps(world: World) -> Measure:
@@ -63,6 +65,23 @@ def _gaps(world: World) -> Measure:
         return float(trials), *false_gaps(world, trials)
 
     return measured
+
+
+def _sometimes(
+    n_runs: int, share: float, effect: float, *, alone: bool = False, unlike: bool = False
+) -> Measure:
+    """`alone`: a single comparison. `unlike`: every second entry is always as good as the others on average."""
+    solved, size = (share, 1.0) if unlike else (share,), (2, 1) if alone else (4, 8)
+    return _gaps(
+        World(
+            n_runs=(n_runs,),
+            run=0.0,
+            solved=solved,
+            effect=effect,
+            n_entries=size[0],
+            n_environments=size[1],
+        )
+    )
 
 
 def _ranks(world: World) -> Measure:
@@ -88,6 +107,10 @@ def _aggregates(n_runs: int, levels: tuple[float, ...]) -> Measure:
 
 _CLEAR, _CLOSE, _EQUAL = (1.0, 2.0, 3.0, 4.0), (3.5, 3.8, 3.9, 4.0), (4.0, 4.0, 4.0, 4.0)
 _UNEVEN = "10 runs, skewed, variances 1 to 16"
+_GAPS = ("suites", "pairs with p ≤ 0.05", "false gap after Holm", "false gap of tie groups")
+_HALF = "solved in 0.5 of runs, effect 3"
+_PAIR, _UNLIKE = "2 entries, 1 environment", "every second entry always half as good"
+
 
 CLAIMS: dict[str, Claim] = {
     "one-run": Claim(
@@ -105,6 +128,33 @@ CLAIMS: dict[str, Claim] = {
         at_least=(92.0,) * 5,
         at_most=(None, 98.5, 98.5, 98.5, 98.5),
     ),
+    "solved-runs": Claim(
+        head="agents that solve a task in some runs (32 cases), runs of each",
+        columns=tuple(map(str, RUNS)),
+        rows={kind: (lambda t, k=kind: [run_coverage(k, n, t) for n in RUNS], 1.0) for kind in SOLVED},
+        at_least=(87.0, 92.0, 92.0, 92.0, 92.0),
+    ),
+    "solved-means": Claim(
+        head="mean of one entry that solves a task in some runs (32 cases), runs",
+        columns=tuple(map(str, SOLVED_RUNS)),
+        rows={kind: (lambda t, k=kind: [mean_coverage(n, k, t) for n in SOLVED_RUNS], 1.0) for kind in SOLVED},
+        at_least=(48.0, 60.0, 66.0, 80.0, 88.0, 90.0, 94.0),
+    ),
+    "solved-gaps": Claim(
+        head="equal entries that solve a task in some runs, 32 cases",
+        columns=_GAPS,
+        rows={
+            **{
+                f"{n} runs, {kind}": (_sometimes(n, *how), 0.2)
+                for kind, how in SOLVED.items()
+                for n in SOLVED_RUNS[:-1]
+            },
+            **{f"{n} runs, {_HALF}, {_PAIR}": (_sometimes(n, 0.5, 3.0, alone=True), 1.0) for n in (4, 5, 10)},
+            **{f"{n} runs, {_HALF}, {_UNLIKE}": (_sometimes(n, 0.5, 3.0, unlike=True), 0.2) for n in (7, 10)},
+        },
+        at_most=(None, None, 5.0, 5.0),
+        exceptions=frozenset(f"{n} runs, {_HALF}, {_UNLIKE}" for n in (7, 10)),
+    ),
     "means": Claim(
         head="mean of one entry (32 cases), runs",
         columns=("1", "3", "10"),
@@ -119,13 +169,13 @@ CLAIMS: dict[str, Claim] = {
         columns=("2", "3", "5", "10"),
         rows={
             kind: (lambda t, k=kind: [welch_coverage(k, n, t) for n in (2, 3, 5, 10)], 1.0)
-            for kind in ("normal", "skewed")
+            for kind in ("normal", "skewed", *(kind for kind in SOLVED if kind.endswith("3")))
         },
         at_least=(89.0,) * 4,
     ),
     "false-gaps": Claim(
         head="equal entries, 8 environments, 32 cases",
-        columns=("suites", "pairs with p ≤ 0.05", "false gap after Holm", "false gap of tie groups"),
+        columns=_GAPS,
         rows={
             **{
                 f"4 entries, {n} run{'s' * (n > 1)}, agent × case {sd:g}": (
@@ -142,7 +192,10 @@ CLAIMS: dict[str, Claim] = {
             "2, 10, 3 and 5 runs, variances 1, 4, 1/4 and 1, agent × case 0.5": (
                 _gaps(World(n_runs=(2, 10, 3, 5), noise=(1.0, 2.0, 0.5, 1.0), interaction=0.5)), 0.4
             ),
-            "1 environment, 3 runs, agent × case 0.5": (_gaps(World(n_environments=1, n_runs=(3,), interaction=0.5)), 1.0),  # noqa: E501
+            "4, 4, 4 and 1 runs that do not vary, agent × case 0.5": (
+                _gaps(World(n_runs=(4, 4, 4, 1), run=0.0, interaction=0.5)), 0.4
+            ),
+            "1 environment, 4 runs, agent × case 0.5": (_gaps(World(n_environments=1, interaction=0.5)), 1.0),
             "4 runs, 0/1, agent × case 0.5": (_gaps(World(shape="0/1", interaction=0.5)), 0.4),
             "1 run, 0/1": (_gaps(World(shape="0/1", n_runs=(1,))), 0.4),
             "4 runs, skewed, agent × case 0.5": (_gaps(World(shape="skewed", interaction=0.5)), 0.4),
@@ -181,7 +234,10 @@ CLAIMS: dict[str, Claim] = {
         head="a difference of the stated size is resolved",
         columns=("share",),
         rows={
-            **{f"{n} runs, smallest difference": (lambda t, n=n: [resolved(n, t)], 1.0) for n in (3, 5, 10)},
+            **{
+                f"{n} runs, smallest difference, by the interval": (lambda t, n=n: [resolved(n, t)], 1.0)
+                for n in (3, 5, 10)
+            },
             "runs needed after Holm over 48 pairs": (lambda t: [resolved(0, t, level=0.05 / 48)], 1.0),
         },
         at_least=(40.0,),

@@ -69,6 +69,14 @@ def test_the_version_and_a_completed_name_import_nothing_large_either() -> None:
     assert not imported(FRONT, **asked) & LARGE - ASYNCIO
 
 
+def test_a_run_ends_without_scipy() -> None:
+    """A gateway alone does not install it."""
+    ends = "import evopolicy_gateway.suite.runs, numpy, evopolicy_common.statistics.intervals as intervals; "
+    found = imported(f"{LISTED}{ends}print(intervals.over_cases(numpy.arange(8.0)).low)")
+    assert "evopolicy_gateway.suite.runs" in found
+    assert "scipy" not in found
+
+
 def test_processes_log_without_importing_rich() -> None:
     names = (
         "evopolicy_coordinator.server.service",

@@ -118,9 +118,10 @@ def _above_random(outcome: Outcome) -> Estimate | None:
     # With numpy, which nothing else in this command needs.
     import numpy as np
 
-    from evopolicy_common.statistics.intervals import difference
+    from evopolicy_common.statistics.intervals import over_cases
 
-    return difference(np.array([returns]), np.array([reference.returns]))
+    played, random = np.array(returns), np.array(reference.returns)
+    return over_cases(played - random, (played, random))
 
 
 def _against_random(difference: Estimate) -> str:

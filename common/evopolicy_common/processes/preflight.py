@@ -154,6 +154,7 @@ EXTRAS = {
     "jinja2": "coordinator",
     "matplotlib": "coordinator",
     "prometheus_client": "coordinator",
+    "scipy": "coordinator",
     "starlette": "gateway",
     "uvicorn": "gateway",
     "h11": "gateway",

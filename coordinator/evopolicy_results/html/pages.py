@@ -81,7 +81,8 @@ _SECTIONS = (
         "Statistics",
         "How sure the scores are",
         "Intervals are at 95 %. Each table says over what: the cases of one run, or runs and cases. No verdict"
-        " contradicts the interval beside it; the correction for many pairs can only withhold one.",
+        " contradicts the interval beside it; the exact test of runs and the correction for many pairs can only"
+        " withhold one.",
         "profiles_*",
         "resolution_*; aggregates_+ improvement_+; pairs_* generalisation_*",
     ),

@@ -26,6 +26,7 @@ from evopolicy_common.records.canary import CANARY
 from evopolicy_common.records.journal import Result
 from evopolicy_common.records.run_record import RunRecord
 from evopolicy_common.records.summary import utc_text
+from evopolicy_common.statistics.intervals import Estimate
 from evopolicy_results.publish import contents
 from evopolicy_results.scoring import scores
 from evopolicy_results.statistics.pairs import cell_mean
@@ -223,8 +224,11 @@ def _cell(env: str, entry: str, start: str, sources: Sequence[Source]) -> Cell:
         is_shared = record.experiment_dimensions.hidden_cases == "shared"
         cases, score = record.versions.cases_hash("heldout") if is_shared else "", record.outcome.score
         returns = result.heldout_returns if score is not None else ()
-        runs.append(scores.RunReturns(score=score, returns=returns, case_set=cases))
-    estimate = cell_mean(scores.Cell(entry=entry, env=env, runs=tuple(runs)))
+        selected = (each for each in result.submits if each.submit_index == result.best_submit_index)
+        policy = next((each.bundle for each in selected), None) or ""
+        runs.append(scores.RunReturns(score=score, returns=returns, case_set=cases, policy=policy))
+    cell = scores.Cell(entry=entry, env=env, runs=tuple(runs))
+    estimate = cell_mean(cell)
     outcomes = [each.record.outcome for each in sources]
     measured = [each.score for each in outcomes if each.score is not None]
     random = [each.random_score for each in outcomes if each.random_score is not None]
@@ -236,9 +240,15 @@ def _cell(env: str, entry: str, start: str, sources: Sequence[Source]) -> Cell:
         mean=mean(measured) if estimate else None,
         low=estimate.low if estimate else None,
         high=estimate.high if estimate else None,
-        over=estimate.reason or estimate.over if estimate else "a run has no score",
+        over=_over(estimate, cell.repeated),
         random=mean(random) if random else None,
     )
+
+
+def _over(estimate: Estimate | None, repeated: str) -> str:
+    if estimate is None:
+        return "a run has no score"
+    return "; ".join(filter(None, (estimate.reason or estimate.over, repeated)))
 
 
 def _agent(entry: str, sources: Sequence[Source]) -> AgentCost:

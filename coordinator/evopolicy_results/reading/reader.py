@@ -19,13 +19,13 @@ from typing import Any
 import msgspec
 from msgspec.structs import replace
 
-from evopolicy_common.errors import ConfigError, ProtocolError
+from evopolicy_common.errors import BundleError, ConfigError, ProtocolError
 from evopolicy_common.messages.bounds import check_plausible
 from evopolicy_common.messages.environment import Split
 from evopolicy_common.messages.gateway import REJECTED
 from evopolicy_common.records.aggregates import mean, std
 from evopolicy_common.records.newest import described
-from evopolicy_common.records.policies.checkpoints import read_meta
+from evopolicy_common.records.policies.checkpoints import CheckpointMeta, bundle_of, read_meta
 from evopolicy_common.records.rescores import Rescored, RescoreRecord, read_rescore
 from evopolicy_common.records.run_files import RUN_JSON, check_places, run_folders, submit_folders
 from evopolicy_common.records.run_record import (
@@ -232,12 +232,20 @@ def _read_submits(folder: Path, record: RunRecord) -> tuple[Submit, ...]:
                 val_mean=(record.outcome.val_scores or {}).get(str(index)),
                 n_failed_episodes=len(summary.errors or ()) if summary is not None else 0,
                 started_at=summary.submit_started_at if summary is not None else "",
-                bundle_digest=meta.bundle if meta is not None else "",
+                bundle_digest=_bundle_digest(meta, checkpoint) if status == "ok" else "",
                 source=source,
                 changed_lines=changed,
             )
         )
     return tuple(submits)
+
+
+def _bundle_digest(meta: CheckpointMeta | None, checkpoint: Path) -> str:
+    """As recorded, or of the checkpoint's files if other software wrote its metadata; empty if there are none."""
+    try:
+        return "" if meta is None else meta.bundle or bundle_of(checkpoint).digest
+    except (BundleError, OSError):
+        return ""
 
 
 @contextmanager

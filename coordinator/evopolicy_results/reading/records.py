@@ -132,6 +132,11 @@ class Run(msgspec.Struct, frozen=True, kw_only=True):
         return next((submit for submit in self.submits if submit.index == best), None)
 
     @property
+    def policy(self) -> str:
+        """Digest of the selected policy's bundle; empty if unknown."""
+        return self.selected.bundle_digest if self.selected is not None else ""
+
+    @property
     def name(self) -> str:
         """`entry / env / exp-id`, plus the repeat number unless it is 0: unique within a report."""
         repeat = f" #{self.record.repeat}" if self.record.repeat else ""

@@ -37,6 +37,8 @@ class Evolution(msgspec.Struct, frozen=True, kw_only=True):
     run: str
     entry: str
     env: str
+    policy: str
+    """Digest of the selected policy's bundle; empty if unknown."""
     budget: int
     steps: tuple[CurvePoint, ...]
     n_improvements: int
@@ -66,6 +68,7 @@ def evolutions(runs: Iterable[Run], references: Mapping[str, float]) -> list[Evo
                 run=run.name,
                 entry=run.entry,
                 env=env,
+                policy=run.policy,
                 budget=run.budget,
                 steps=steps,
                 n_improvements=sum(step.improved for step in steps[1:]),

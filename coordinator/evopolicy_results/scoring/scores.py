@@ -46,6 +46,8 @@ class RunReturns(msgspec.Struct, frozen=True, kw_only=True):
     """By case, in the order of its case set; empty if only the score is known."""
     case_set: str = ""
     """Equal for runs that played the same cases; empty: cases that no other run has."""
+    policy: str = ""
+    """Digest of the selected policy's bundle; empty if unknown."""
 
 
 class Cell(msgspec.Struct, frozen=True, kw_only=True):
@@ -76,6 +78,30 @@ class Cell(msgspec.Struct, frozen=True, kw_only=True):
     @property
     def n_runs(self) -> int:
         return len(self.runs)
+
+    @property
+    def samples(self) -> list[list[int]]:
+        """Its runs as `by_policy` groups them."""
+        return by_policy([run.policy for run in self.runs])
+
+    @property
+    def repeated(self) -> str:
+        """Which of its runs returned the same policy, such as `both repeats returned the same policy`; empty if none
+        did."""
+        sizes = [len(sample) for sample in self.samples if len(sample) > 1]
+        if not sizes:
+            return ""
+        n = self.n_runs
+        if sizes == [n]:
+            return f"{'both' if n == 2 else f'all {n}'} repeats returned the same policy"
+        returned = "the same policy" if len(sizes) == 1 else f"{len(sizes)} policies"
+        return f"{sum(sizes)} of {n} repeats returned {returned}"
+
+
+def by_policy(policies: Sequence[str]) -> list[list[int]]:
+    """The places of runs, given the digests of their selected policies. Those whose policies are equal byte for byte
+    are together, as one sample of what the agent returns; a run whose policy is not known is a sample of its own."""
+    return list(grouped(range(len(policies)), lambda place: policies[place] or str(place)).values())
 
 
 class ScoreTable(msgspec.Struct, frozen=True, kw_only=True):
@@ -155,6 +181,7 @@ def returns_of(run: Run) -> RunReturns:
         score=run.score,
         returns=run.record.outcome.heldout_returns if run.score is not None else (),
         case_set=run.record.versions.cases_hash("heldout") if shared else "",
+        policy=run.policy,
     )
 
 

@@ -17,9 +17,7 @@ from collections.abc import Mapping, Sequence
 import msgspec
 import numpy as np
 
-from evopolicy_common.statistics.distributions import ALPHA
-from evopolicy_common.statistics.intervals import no_spread
-from evopolicy_common.statistics.resampling import RESAMPLES, Floats, weights
+from evopolicy_common.statistics.intervals import ALPHA, RESAMPLES, Floats, no_spread, weights
 from evopolicy_results.scoring.scores import Cell, Scale
 from evopolicy_results.statistics.pairs import returns_in
 
@@ -93,6 +91,8 @@ class _Cell(msgspec.Struct, frozen=True, kw_only=True):
     only the order matters for a probability of improvement."""
     counted: Floats | None = None
     """`returns` of a normalised cell, normalised."""
+    n_samples: int = 1
+    """Runs that returned the same policy are one."""
     stretched: Floats | None = None
     """Stretched to the variance of that many runs; None if nothing can be resampled."""
     over: str = ""
@@ -125,22 +125,23 @@ def aggregates(
 def _drawn(sample: Cell, seed: tuple[int, int], resamples: int) -> _Cell:
     """Resamples of runs about the mean of resampled cases."""
     scores = np.array([-np.inf if run.score is None else run.score for run in sample.runs], dtype=np.float64)
-    n, known, shift = len(scores), returns_in(sample), np.zeros((resamples, 1))
+    n, known, shift = len(sample.samples), returns_in(sample), np.zeros((resamples, 1))
     if known is not None and (n_cases := known.shape[1]) > 1:
         # All entries share the draws of cases, as they share the cases.
         by_case = known.mean(axis=0)
-        drawn = weights(n_cases, n_cases, resamples, seed[0]) @ (by_case - by_case.mean()) / n_cases
+        drawn = weights(n_cases, resamples, seed[0]) @ (by_case - by_case.mean()) / n_cases
         shift = drawn[:, None]
     elif n == 1 and np.isfinite(scores[0]):
         return _Cell(scores=scores)
     if n == 1:
         return _Cell(scores=scores, returns=scores + shift, stretched=scores + shift, over="cases")
-    stretched = returns = scores[np.random.default_rng([21, *seed]).integers(0, n, (resamples, n))] + shift
+    places = np.random.default_rng([21, *seed]).integers(0, len(scores), (resamples, n))
+    stretched = returns = scores[places] + shift
     if np.isfinite(scores).all():
         middle = scores.mean() + shift
         stretched = middle + np.sqrt(n / (n - 1)) * (returns - middle)
     over = "runs" if known is None else "runs and cases"
-    return _Cell(scores=scores, returns=returns, stretched=stretched, over=over)
+    return _Cell(scores=scores, returns=returns, stretched=stretched, n_samples=n, over=over)
 
 
 def _drawn_scale(here: Sequence[Cell], cells: Mapping[str, _Cell], scale: Scale) -> tuple[Floats, Floats]:
@@ -165,7 +166,7 @@ def _normalised(cell: _Cell, scale: Scale, low: Floats, width: Floats) -> _Cell:
         with np.errstate(divide="ignore", invalid="ignore"):
             return np.nan_to_num((drawn - low) / width, nan=0.0, posinf=np.inf, neginf=-np.inf)
 
-    returns = None if 1 < len(cell.scores) < LEAST_RUNS else cell.returns
+    returns = None if 1 < cell.n_samples < LEAST_RUNS else cell.returns
     return _Cell(
         scores=(cell.scores - scale.random) / (scale.best - scale.random),
         returns=returns,

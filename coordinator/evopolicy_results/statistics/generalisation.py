@@ -13,10 +13,11 @@ from statistics import fmean
 
 import msgspec
 
-from evopolicy_common.statistics.intervals import Estimate, of_runs
+from evopolicy_common.statistics.intervals import Estimate
 from evopolicy_results.reading.environments import family_of
 from evopolicy_results.reading.records import Run, by_cell
 from evopolicy_results.scoring.scores import Scale, mean_of_all
+from evopolicy_results.statistics.intervals import of_runs
 
 SUCCESS_ABOVE = {"minigrid": 0.0, "gym/acrobot": -500.0, "gym/continuouscar": 0.0}
 """By family or environment, the return above which an episode has reached its goal. MiniGrid pays 1 − 0.9 ·

@@ -1,8 +1,13 @@
-"""Each pair of entries on every environment: gap, interval, p value, and Holm's correction over all pairs of the suite;
-the smallest gap that an experiment resolves at 95 %, and the number of repeats that a given gap would need.
+"""Each pair of entries on every environment: gap, interval, p values, and Holm's correction over all pairs of the
+suite; the smallest gap that an experiment resolves at 95 %, and the number of repeats that a given gap would need.
 
-The verdict rests on the interval's own distribution, so it never contradicts the interval: the uncorrected p is at most
-0.05 exactly if the interval excludes 0, and the corrected p is no smaller.
+Agents with several runs are distinguished only if two tests agree at the corrected level. The p value of the interval
+covers other cases, but relies on the variance that a few runs show: agents that solve a task in some runs may all agree
+by chance. The exact test of exchanging runs relies on no variance, but takes the cases as given. The correction is of
+the larger p value, so a verdict never contradicts the interval beside it: the interval's own p is at most 0.05 exactly
+if the interval excludes 0.
+
+Repeats that returned the same policy, byte for byte, are one sample.
 """
 
 from __future__ import annotations
@@ -18,19 +23,27 @@ import msgspec
 import numpy as np
 from msgspec.structs import replace
 
-from evopolicy_common.statistics import intervals
-from evopolicy_common.statistics.distributions import ALPHA, holm, normal_quantile, t_two_sided
-from evopolicy_common.statistics.intervals import Estimate, components, difference, of_runs
-from evopolicy_common.statistics.resampling import RESAMPLES, Floats, label_patterns
+from evopolicy_common.statistics.intervals import (
+    ALPHA,
+    RESAMPLES,
+    Estimate,
+    Floats,
+    normal_quantile,
+    normal_two_sided,
+)
 from evopolicy_results.scoring.scores import Cell, Scale
+from evopolicy_results.statistics import intervals
+from evopolicy_results.statistics.intervals import components, difference, holm, of_runs, t_two_sided
 
-Verdict = Literal["first", "second", "not told apart", "not comparable"]
+Verdict = Literal["first", "second", "not told apart", "too few runs", "not comparable"]
 
 NO_COMMON_CASES = "no common cases"
 NO_RETURNS = "returns by case are not known"
 NO_SCORE = "a run has no ok submit"
 MAX_CASES = 100_000
 MAX_REPEATS = 1000
+MAX_EXCHANGED = 40
+"""Runs of two entries up to which all exchanges are counted."""
 _CLOSE = 1e-9
 """Relative tolerance: statistics that differ only by rounding count as equal."""
 
@@ -44,24 +57,26 @@ class Pair(msgspec.Struct, frozen=True, kw_only=True):
     gap: Estimate | None
     """`first − second`, held-out mean return on the common cases; None if either has no score."""
     compares: Literal["agents", "checkpoints"]
-    """`checkpoints`: an entry has one run here, so the variation between its runs is unknown."""
+    """`checkpoints`: an entry has one run here, or one policy from all its runs, so the variation between its runs is
+    unknown."""
     n_runs: tuple[int, int]
+    """Runs that returned the same policy count as one."""
     n_cases: int
     """Common cases; 0 if runs are compared by their scores alone."""
     n_left_out: int
     """Cases that only some of the runs have; they cannot be paired."""
     p: float | None
     """Two-sided p value of no difference, from the interval's distribution; None without an interval."""
+    p_exchange: float | None
+    """p value of the exchange of runs on these given cases (`exchange_test`); None unless agents are compared."""
     p_holm: float | None = None
-    """Corrected over all pairs of the suite, those with the random reference included."""
-    p_these_cases: float | None
-    """p value of an exchange of runs on these given cases; None unless both have several runs. No verdict uses it."""
+    """The larger of both, corrected over all pairs of the suite, those with the random reference included."""
     verdict: Verdict = "not comparable"
-    """The better entry by the corrected p at 5 %."""
+    """The better entry by the corrected p at 5 %. `too few runs`: no returns of so few runs could reach that level."""
     n_needed: int | None = None
     """Where agents are not told apart, runs of each (else held-out cases) with which every second experiment would
     resolve a difference of this size at the level that Holm's correction leaves; None where unknown or where more do
-    not help."""
+    not help. With too few runs, at least as many as that level needs."""
     reason: str
     """Why there is no interval; empty otherwise."""
 
@@ -70,7 +85,7 @@ class Matched(msgspec.Struct, frozen=True, kw_only=True):
     """Cells on the cases that all their runs have."""
 
     returns: tuple[Floats, ...]
-    """One matrix runs × cases per cell."""
+    """One matrix runs × cases per cell; runs that returned the same policy are one row."""
     n_left_out: int
     """Number of cases that only some of the runs have."""
 
@@ -90,8 +105,9 @@ def matched(cells: Sequence[Cell]) -> Matched | None:
     if not common.any():
         return None
     ends = np.cumsum([len(cell.runs) for cell in cells])
+    own = np.split(every[:, common], ends[:-1])
     return Matched(
-        returns=tuple(np.split(every[:, common], ends[:-1])),
+        returns=tuple(clustered(values, cell.samples) for cell, values in zip(cells, own, strict=True)),
         n_left_out=int(has.any(axis=0).sum() - common.sum()),
     )
 
@@ -100,6 +116,20 @@ def returns_in(cell: Cell) -> Floats | None:
     """A matrix runs × cases, of the cases that all of the cell's runs have; None if there are none."""
     common = matched([cell])
     return None if common is None else common.returns[0]
+
+
+def scores_in(cell: Cell) -> Floats | None:
+    """The scores of its samples; None when a run has no ok submit."""
+    return None if cell.scores is None else clustered(np.array(cell.scores), cell.samples)
+
+
+def clustered(values: Floats, samples: Sequence[Sequence[int]]) -> Floats:
+    """One row per sample from one row per run. The mean of the rows stays that of all runs, and their variance over
+    their number is that of a mean of clusters (Cameron and Miller 2015, with the factor k/(k − 1) of k clusters)."""
+    if len(samples) == len(values):
+        return values
+    mean, factor = values.mean(axis=0), len(samples) / len(values)
+    return np.array([mean + factor * (values[one] - mean).sum(axis=0) for one in map(list, samples)])
 
 
 def pairs(
@@ -116,75 +146,90 @@ def pairs(
         for one, other in itertools.combinations(entries, 2)
         if (one, env) in samples and (other, env) in samples
     ]
-    corrected = holm([pair.p for pair, _ in compared])
+    corrected = holm(
+        [None if pair.p is None else max(pair.p, pair.p_exchange or 0.0) for pair, _ in compared]
+    )
     n_open = sum(p is not None and p > ALPHA for p in corrected)
     return [_decided(pair, common, p, n_open) for (pair, common), p in zip(compared, corrected, strict=True)]
 
 
 def _compared(first: Cell, second: Cell, resamples: int) -> tuple[Pair, Matched | None]:
     """The pair without its correction for all others, and the returns on the common cases."""
-    gap, common, p_these_cases = None, None, None
-    several, is_fixed = (len(first.runs) > 1, len(second.runs) > 1), second.fixed is not None
-    if first.scores is not None and second.scores is not None:
+    gap, common, p_exchange = None, None, None
+    n_runs = len(first.samples), len(second.samples)
+    one, other = scores_in(first), scores_in(second)
+    if one is not None and other is not None:
         common = matched((first, second))
         if common is not None:
-            gap = difference(*common.returns, resamples=resamples, fixed=is_fixed)
-            if all(several):
-                p_these_cases = label_test(*(matrix.mean(axis=1).tolist() for matrix in common.returns))
-        elif all(several):
-            gap = of_runs(first.scores, second.scores)
+            gap = difference(*common.returns, resamples=resamples)
+            one, other = (matrix.mean(axis=1) for matrix in common.returns)
+        elif min(n_runs) > 1:
+            gap = of_runs(one, other)
         else:
             known = all(run.returns for run in (*first.runs, *second.runs))
-            value = float(np.mean(first.scores) - np.mean(second.scores))
+            value = float(np.mean(one) - np.mean(other))
             gap = Estimate(value=value, reason=NO_COMMON_CASES if known else NO_RETURNS)
+        p_exchange = exchange_test(one, other) if min(n_runs) > 1 else None
     pair = Pair(
         env=first.env,
         first=first.entry,
         second=second.entry,
         gap=gap,
-        compares="agents" if several[0] and (several[1] or is_fixed) else "checkpoints",
-        n_runs=(len(first.runs), len(second.runs)),
+        compares="agents" if min(n_runs) > 1 else "checkpoints",
+        n_runs=n_runs,
         n_cases=0 if common is None else common.returns[0].shape[1],
         n_left_out=0 if common is None else common.n_left_out,
         p=None if gap is None else gap.p,
-        p_these_cases=p_these_cases,
+        p_exchange=p_exchange,
         reason=NO_SCORE if gap is None else gap.reason,
     )
     return pair, common
 
 
-def label_test(first: Sequence[float], second: Sequence[float], n_random: int = 1999) -> float:
-    """p value of two groups of run scores, of two or more runs each, coming from one distribution.
+def exchange_test(first: Floats, second: Floats) -> float:
+    """Two-sided p value of two groups of run scores from one distribution: the share of all divisions of the runs into
+    two groups of these sizes whose means differ at least as much (the exact permutation test). Above `MAX_EXCHANGED`
+    runs, its normal approximation (Hoeffding 1951).
 
     It takes the cases as given. Agents that differ by case therefore differ here even if they are equal on average over
-    all cases, and more so with more runs. The statistic is Welch's t, so that entries of equal mean and unequal spread
-    are not reported as different when there are many runs (Janssen 1997). All patterns are tried if they are few,
-    otherwise a random sample plus the observed pattern.
+    all cases, and more so with more runs.
     """
-    sizes = len(first), len(second)
-    pooled = np.array([*first, *second])
-    pooled = pooled - pooled.mean()
-    patterns, exact = label_patterns(*sizes, n_random)
-    observed = float(_welch(np.repeat([[1.0, 0.0]], sizes, axis=1), pooled, *sizes)[0])
-    reached = int((_welch(patterns, pooled, *sizes) >= observed * (1.0 - _CLOSE)).sum())
-    return reached / len(patterns) if exact else (reached + 1.0) / (len(patterns) + 1.0)
+    n, values = len(first), np.concatenate([first, second])
+    n_all = len(values)
+    values = values - values.mean()
+    values /= np.abs(values).max() or 1.0
+    least = abs(values[:n].sum()) - _CLOSE
+    if n_all > MAX_EXCHANGED:
+        variance = float((values**2).sum()) * n * (n_all - n) / (n_all * (n_all - 1))
+        return normal_two_sided(max(0.0, least) / math.sqrt(variance)) if variance > 0.0 else 1.0
+    # Sums of the first group are those of its members in either half of all runs.
+    halves = _sums_of_subsets(values[: n_all // 2]), _sums_of_subsets(values[n_all // 2 :])
+    reached = 0
+    for taken, sums in enumerate(halves[0]):
+        if 0 <= n - taken < len(halves[1]):
+            others = halves[1][n - taken]
+            reached += int((len(others) - np.searchsorted(others, least - sums)).sum())
+            reached += int(np.searchsorted(others, -least - sums, side="right").sum())
+    return min(1.0, reached / math.comb(n_all, n))
 
 
-def _welch(labels: Floats, pooled: Floats, n_first: int, n_second: int) -> Floats:
-    """The absolute t of each pattern: 0 without spread and difference, infinite for a difference without spread."""
-    scale = float(np.abs(pooled).max(initial=0.0))
-    if scale == 0.0:
-        return np.zeros(len(labels))
-    values = pooled / scale
-    sums, squares = labels @ values, labels @ values**2
-    first, second = sums / n_first, (values.sum() - sums) / n_second
-    v_first = np.maximum(0.0, squares / n_first - first**2) / (n_first - 1)
-    v_second = np.maximum(0.0, ((values**2).sum() - squares) / n_second - second**2) / (n_second - 1)
-    gap, error = np.abs(first - second), np.sqrt(v_first + v_second)
-    error = np.where(error < _CLOSE, 0.0, error)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        t: Floats = np.where(gap < _CLOSE, 0.0, gap / error)
-    return t
+def _sums_of_subsets(values: Floats) -> list[Floats]:
+    """The sums of all subsets by their number of members, each sorted."""
+    by_size, none = [np.zeros(1)], np.zeros(0)
+    for value in values:
+        grown = [none, *(sums + value for sums in by_size)]
+        by_size = [np.concatenate(both) for both in zip([*by_size, none], grown, strict=True)]
+    return [np.sort(sums) for sums in by_size]
+
+
+def _least_p(n_first: int, n_second: int) -> float:
+    """The smallest p value of an exchange of so many runs."""
+    return (2.0 if n_first == n_second else 1.0) / math.comb(n_first + n_second, n_first)
+
+
+def least_runs(level: float) -> int:
+    """The fewest runs of each agent whose exchange can reach `level`."""
+    return next(n for n in itertools.count(2) if _least_p(n, n) <= level)
 
 
 def _decided(pair: Pair, common: Matched | None, p_holm: float | None, n_open: int) -> Pair:
@@ -193,7 +238,11 @@ def _decided(pair: Pair, common: Matched | None, p_holm: float | None, n_open: i
         return pair
     if p_holm <= ALPHA:
         return replace(pair, p_holm=p_holm, verdict="first" if pair.gap.value > 0.0 else "second")
-    n_needed = None if common is None else _needed(pair, pair.gap, common, ALPHA / n_open)
+    level = ALPHA / n_open
+    n_needed = None if common is None else _needed(pair, pair.gap, common, level)
+    if pair.compares == "agents" and _least_p(*pair.n_runs) > level:
+        n_needed = max(n_needed or 0, least_runs(level))
+        return replace(pair, p_holm=p_holm, verdict="too few runs", n_needed=n_needed)
     return replace(pair, p_holm=p_holm, verdict="not told apart", n_needed=n_needed)
 
 
@@ -202,7 +251,7 @@ def _needed(pair: Pair, gap: Estimate, common: Matched, level: float) -> int | N
         return None
     if pair.compares == "agents":
         n = repeats_needed(spread_of(*common.returns), abs(gap.value), level=level)
-        return n and max(n, 1 + max(len(matrix) for matrix in common.returns if len(matrix) > 1))
+        return n and max(n, 1 + max(pair.n_runs))
     if gap.p is None or gap.p >= 1.0 - 1e-9:
         return None
     factor = normal_quantile(1.0 - level / 2.0) / normal_quantile(1.0 - gap.p / 2.0)
@@ -222,7 +271,7 @@ class Spread(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def spread_of(*returns: Floats) -> Spread:
-    """Variances of two agents, from matrices runs × the same cases. A matrix of one row is one fixed policy."""
+    """Variances of two agents, from matrices runs × the same cases."""
     parts = [components(matrix) for matrix in returns]
     gaps = components((returns[0].mean(axis=0) - returns[1].mean(axis=0))[None, :])
     return Spread(
@@ -233,9 +282,9 @@ def spread_of(*returns: Floats) -> Spread:
 
 
 def repeats_needed(spread: Spread, gap: float, *, level: float = ALPHA) -> int | None:
-    """The fewest runs per agent, from 2, whose interval of a difference, at 1 − `level`, is no wider than ± `gap`. A
-    true gap of that size is then distinguished from 0 in half of all experiments. None if no number up to
-    `MAX_REPEATS` does: the gap needs more cases. Raises ValueError for a gap that is not above 0."""
+    """The fewest runs per agent whose exchange can reach `level` and whose interval of a difference, at 1 − `level`, is
+    no wider than ± `gap`. A true gap of that size is then distinguished from 0 in about half of all experiments. None
+    if no number up to `MAX_REPEATS` does: the gap needs more cases. Raises ValueError for a gap that is not above 0."""
     if not gap > 0.0:
         raise ValueError(f"a gap of {gap} cannot be resolved; give one above 0")
 
@@ -243,7 +292,8 @@ def repeats_needed(spread: Spread, gap: float, *, level: float = ALPHA) -> int |
         error, df = standard_error(spread, n)
         return error <= 0.0 or t_two_sided(gap / error, df) <= level
 
-    n = 2 + bisect.bisect_left(range(2, MAX_REPEATS + 1), True, key=resolves)
+    least = least_runs(level)
+    n = least + bisect.bisect_left(range(least, MAX_REPEATS + 1), True, key=resolves)
     return n if n <= MAX_REPEATS else None
 
 
@@ -260,13 +310,11 @@ def standard_error(spread: Spread, n: int) -> tuple[float, float]:
 
 def cell_mean(cell: Cell, *, resamples: int = RESAMPLES) -> Estimate | None:
     """An entry's held-out mean on one environment; None if a run has no ok submit."""
-    if cell.scores is None:
+    if (scores := scores_in(cell)) is None:
         return None
     if (returns := returns_in(cell)) is not None:
         return intervals.mean(returns, resamples=resamples)
-    if len(cell.runs) == 1:
-        return Estimate(value=cell.scores[0], reason=NO_RETURNS)
-    return of_runs(cell.scores)
+    return Estimate(value=float(scores[0]), reason=NO_RETURNS) if len(scores) == 1 else of_runs(scores)
 
 
 GAPS = (0.05, 0.1, 0.2)
@@ -315,7 +363,7 @@ def resolutions(
         own = [pair for pair in compared if pair.env == env and {pair.first, pair.second} <= set(agents)]
         gaps = [pair.gap for pair in own if pair.gap is not None]
         halves = [0.5 * (g.high - g.low) for g in gaps if g.low is not None and g.high is not None]
-        n_runs = [len(sample.runs) for sample in here]
+        n_runs = [len(sample.samples) for sample in here]
         out.append(
             Resolution(
                 env=env,

@@ -16,15 +16,16 @@ import itertools
 import math
 import string
 from collections.abc import Mapping, Sequence
+from functools import lru_cache
 
 import msgspec
 import numpy as np
 
-from evopolicy_common.statistics.distributions import ALPHA, holm
-from evopolicy_common.statistics.resampling import RESAMPLES, Floats, t_weights
+from evopolicy_common.statistics.intervals import ALPHA, RESAMPLES, Floats
 from evopolicy_results.reading.environments import by_name
 from evopolicy_results.scoring.scores import Cell
-from evopolicy_results.statistics.pairs import Pair, returns_in
+from evopolicy_results.statistics.intervals import holm
+from evopolicy_results.statistics.pairs import Pair, returns_in, scores_in
 
 _BOUNDS = (ALPHA / 2.0, 1.0 - ALPHA / 2.0)
 MAX_GROUPS = 200
@@ -57,6 +58,20 @@ class Standings(msgspec.Struct, frozen=True, kw_only=True):
     def of(self, entry: str) -> RankEstimate | None:
         """The row of `entry`; None if it has none."""
         return next((row for row in self.rows if row.entry == entry), None)
+
+
+@lru_cache(maxsize=8)
+def t_weights(n: int, draws: int, seed: int) -> Floats:
+    """(draws, n) weights w such that `mean + w @ (values − mean)` is distributed as Student's t with n − 1 degrees of
+    freedom about the mean of n values, with its standard error as scale. Values of several variables get a common
+    multivariate t. Zeros for n = 1. Read-only."""
+    if n == 1:
+        return np.zeros((draws, 1))
+    generator = np.random.default_rng([13, seed, n])
+    drawn: Floats = generator.normal(size=(draws, n))
+    drawn /= np.sqrt(n * generator.chisquare(n - 1, size=(draws, 1)))
+    drawn.setflags(write=False)
+    return drawn
 
 
 def standings(
@@ -103,7 +118,7 @@ def standings(
         float(np.diff(np.quantile(drawn[one] - drawn[other], _BOUNDS))[0]) / 2.0
         for one, other in itertools.combinations([entry for entry in sure if entry not in fixed], 2)
     ]
-    kinds = {len(sample.runs) > 1 for sample in samples.values() if sample.fixed is None}
+    kinds = {len(sample.samples) > 1 for sample in samples.values() if sample.fixed is None}
     over = " or ".join(text for many, text in ((False, "cases"), (True, "runs and cases")) if many in kinds)
     return Standings(rows=tuple(rows), gap=float(np.median(halves)) if halves else None, over=over)
 
@@ -120,7 +135,8 @@ def _drawn_scores(
     for number, env in enumerate(environments):
         means = np.empty_like(total)
         for i, entry in enumerate(entries):
-            sample, scores = samples[entry, env], samples[entry, env].scores
+            sample = samples[entry, env]
+            scores = scores_in(sample)
             if scores is None:  # a run without an ok submit has the worst rank in every resample
                 means[i] = -math.inf
             elif (drawn := _drawn_mean(sample, scores, i, number, resamples)) is not None:
@@ -136,9 +152,9 @@ def _drawn_scores(
     return {entry: mean[i] for i, entry in enumerate(entries) if entry in varying}
 
 
-def _drawn_mean(sample: Cell, known: Sequence[float], entry: int, env: int, resamples: int) -> Floats | None:
+def _drawn_mean(sample: Cell, scores: Floats, entry: int, env: int, resamples: int) -> Floats | None:
     """Resampled means; None if the sample shows no spread."""
-    scores, returns = np.array(known), returns_in(sample)
+    returns = returns_in(sample)
     if returns is None:
         returns = np.zeros((1, 1))
     else:

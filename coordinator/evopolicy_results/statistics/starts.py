@@ -13,7 +13,7 @@ from collections.abc import Iterable, Sequence
 import msgspec
 
 from evopolicy_common.messages.run_settings import Start
-from evopolicy_common.statistics.resampling import RESAMPLES
+from evopolicy_common.statistics.intervals import RESAMPLES
 from evopolicy_results.reading.environments import grouped
 from evopolicy_results.reading.records import Run
 from evopolicy_results.scoring.scores import Cell, returns_of

@@ -18,11 +18,12 @@ import numpy as np
 
 from evopolicy_common.catalogue.anchors import Anchor, anchor
 from evopolicy_common.catalogue.worlds import unchanged
-from evopolicy_common.statistics.intervals import Estimate, Over, Stratum, stratified, stratum, stratum_of
+from evopolicy_common.statistics.intervals import Estimate, Over
 from evopolicy_results.reading.environments import family_of, grouped
 from evopolicy_results.scoring.evolution import Evolution
-from evopolicy_results.scoring.scores import Cell, ScoreTable
-from evopolicy_results.statistics.pairs import returns_in
+from evopolicy_results.scoring.scores import Cell, ScoreTable, by_policy
+from evopolicy_results.statistics.intervals import Stratum, stratified, stratum, stratum_of
+from evopolicy_results.statistics.pairs import clustered, returns_in
 
 N_POINTS = 64
 """Intervals of episodes between the points of a curve."""
@@ -103,7 +104,9 @@ def _cell(env: str, samples: Sequence[Cell | None]) -> _Cell | None:
 
 def _stratum(sample: Cell, scale: Anchor) -> Stratum:
     if (returns := returns_in(sample)) is None:
-        return stratum_of([scale.normalised(score) for score in sample.scores or ()])
+        return stratum_of(
+            clustered(np.array([scale.normalised(score) for score in sample.scores or ()]), sample.samples)
+        )
     return stratum((returns - scale.random.mean) / scale.width)
 
 
@@ -132,12 +135,15 @@ def _curve(evolutions: Sequence[Evolution], pairs: dict[str, list[str]]) -> tupl
     budget = max(one.budget for env in whole for one in by_env[env])
     share = [1.0 / len(whole)] * len(whole)
 
+    def unchanged_at(env: str, levels: list[float]) -> Stratum:
+        return stratum_of(clustered(np.array(levels), by_policy([one.policy for one in by_env[env]])))
+
     def point(episodes: int) -> CurvePoint:
         levels = {env: [_level(one, episodes) for one in by_env[env]] for env in played}
         after = [stratum_of([fmean(levels[each]) for each in worlds]) for worlds in whole.values()]
         return CurvePoint(
             episodes=episodes,
-            unchanged=stratified([stratum_of(levels[env]) for env in whole], share, "runs"),
+            unchanged=stratified([unchanged_at(env, levels[env]) for env in whole], share, "runs"),
             worlds=stratified(after, share, "worlds, runs, and cases"),
         )
 

@@ -7,8 +7,7 @@ from pathlib import Path
 
 import msgspec
 
-from evopolicy_common.statistics.intervals import Estimate
-from evopolicy_common.statistics.resampling import RESAMPLES
+from evopolicy_common.statistics.intervals import RESAMPLES, Estimate
 from evopolicy_results.behaviour.audit import TokenUse, mean_phases, token_use
 from evopolicy_results.behaviour.edits import (
     EditRates,

@@ -183,7 +183,8 @@ def _cells(suite: Suite) -> Table:
 
     def over(cell: Cell) -> str | None:
         mean = means.get((cell.entry, cell.env))
-        return None if mean is None or mean.low is None else mean.over
+        units = None if mean is None or mean.low is None else mean.over
+        return "; ".join(filter(None, (units, cell.repeated))) or None
 
     place = {env: i for i, env in enumerate(suite.table.environments)}
     table = tabulated(

@@ -8,10 +8,10 @@ from typing import Any
 
 from msgspec.structs import replace
 
-from evopolicy_common.statistics.distributions import ALPHA
-from evopolicy_results.reading.environments import title_of
+from evopolicy_common.statistics.intervals import ALPHA
+from evopolicy_results.reading.environments import grouped, title_of
 from evopolicy_results.statistics.aggregates import LEAST_RUNS, TAUS
-from evopolicy_results.statistics.pairs import GAPS, MAX_REPEATS, Pair
+from evopolicy_results.statistics.pairs import GAPS, MAX_REPEATS, Pair, least_runs
 from evopolicy_results.statistics.starts import StartGroup
 from evopolicy_results.studies.study import Suite
 from evopolicy_results.tables.run_tables import ENTRY, ENV, RUNS
@@ -43,12 +43,13 @@ def statistics_tables(suite: Suite) -> list[Table]:
             "Every two entries on every environment: first minus second, in held-out returns of the cases that both"
             " have. Interval: 95 %, for one environment and pair alone, over what the column Over names. p: of no"
             " difference, two-sided, from the interval's own distribution; it is at most 0.05 exactly if the interval"
-            " excludes 0. Corrected p: Holm, over all rows of this table together, so a false difference in any row has"
-            " a probability of at most 5 %. Significant: corrected p at most 0.05. About how many runs (or cases) would"
-            " be needed: so many that every second experiment resolves a true difference of the size seen here, whose"
-            " own size is uncertain. These cases only: permutation test that exchanges runs and takes the cases as"
-            " given; with other cases the difference may vanish, and no verdict rests on it. The tie groups of the"
-            " leaderboard are a second family of comparisons at 5 %, so both together have at most 10 %."
+            " excludes 0. Exchange p: exact test that exchanges the runs of both agents, on these cases; it does not"
+            " rely on the variance of a few runs. Corrected p: Holm, of the larger of both p, over all rows of this"
+            " table together. Significant: corrected p at most 0.05. Too few runs to tell: no returns of so few runs"
+            " could reach the corrected level. About how many runs (or cases) would be needed: so many that every"
+            " second experiment resolves a true difference of the size seen here, whose own size is uncertain. Against"
+            " the random policy, which is one policy, an agent's selected checkpoints are compared. The tie"
+            " groups of the leaderboard are a second family of comparisons."
             + checkpoints(suite)
             + f" In {n_unpaired} rows the entries' cases differ: only common cases pair, and the others are left out."
             * bool(n_unpaired),
@@ -100,13 +101,21 @@ def _above(tau: float) -> tuple[Column, Column]:
 
 
 def checkpoints(suite: Suite) -> str:
-    """A caption's sentence where an agent has one run on an environment; else empty."""
-    if all(pair.compares == "agents" for pair in suite.statistics.pairs):
-        return ""
-    return (
-        " With one run a cell this compares the selected checkpoints, not the agents: how an agent's runs vary is not"
-        " known."
-    )
+    """A caption's sentences where an agent has one run on an environment, or runs that returned the same policy; else
+    empty."""
+    cells = [cell for cell in suite.table.cells.values() if cell.fixed is None]
+    parts = []
+    if any(len(cell.samples) == 1 for cell in cells):
+        parts.append(
+            "With one run or policy a cell this compares the selected checkpoints, not the agents: how an agent's runs"
+            " vary is not known."
+        )
+    same = grouped((cell for cell in cells if cell.repeated), lambda cell: (cell.entry, cell.repeated))
+    if same:
+        parts.append("Runs that returned the same policy, byte for byte, are one sample.")
+    for (entry, repeated), several in same.items():
+        parts.append(f"{entry}, {', '.join(title_of(cell.env) for cell in several)}: {repeated}.")
+    return "".join(f" {part}" for part in parts)
 
 
 def _with_interval(field: str) -> Callable[[Pair], str | None]:
@@ -119,8 +128,9 @@ def _told_apart(pair: Pair) -> str | None:
     if pair.verdict == "not comparable":
         return None
     is_of_checkpoints = pair.compares == "checkpoints"
-    # One run is that of the random reference.
-    n = str(pair.n_cases) if is_of_checkpoints else " and ".join(map(str, sorted({*pair.n_runs} - {1})))
+    n = str(pair.n_cases) if is_of_checkpoints else " and ".join(map(str, sorted({*pair.n_runs})))
+    if pair.verdict == "too few runs":
+        return f"too few runs to tell with {n}; about {pair.n_needed} would do"
     # The interval beside it is for this pair alone.
     alone = pair.p is not None and pair.p <= ALPHA
     text = "not after the correction for all pairs" if alone else "not distinguishable"
@@ -142,12 +152,17 @@ _PAIR = (
     replace(OVER, of=_with_interval("over")),
     Column("method", "Method", of=_with_interval("method")),
     Column("p", "p", "number", digits=4, below=True),
+    Column("p_exchange", "Exchange p", "number", digits=4, below=True),
     Column("p_holm", "Corrected p", "number", digits=4, below=True),
     Column("told_apart", "Significantly better", note=_BETTER, of=_told_apart),
     Column("needed", "Needed", "integer", note=_NEEDED, of="n_needed"),
-    Column("p_these_cases", "p, these cases only", "number", digits=4, below=True),
-    Column("compares", "Compares", note="Checkpoints, where an entry has one run; else agents."),
-    Column("runs", "Runs", of=lambda pair: "{} and {}".format(*pair.n_runs)),
+    Column("compares", "Compares", note="Checkpoints, where an entry has one run or policy; else agents."),
+    Column(
+        "runs",
+        "Runs",
+        note="Runs that returned the same policy are one.",
+        of=lambda pair: "{} and {}".format(*pair.n_runs),
+    ),
     Column("cases", "Cases", "integer", of=lambda pair: pair.n_cases or None),
     Column("left_out", "Cases left out", "integer", note=_UNPAIRED, of="n_left_out"),
 )
@@ -204,9 +219,10 @@ def _resolution(suite: Suite) -> Table:
         ),
         [*suite.statistics.resolutions, *([whole] if whole is not None else [])],
         "The smallest difference between two agents that these cases and runs resolve: the half width of its 95 %"
-        " interval, median over pairs, in returns and as a share of the random-to-best scale. A true difference of"
-        " that size is resolved every second time. Repeats: runs of each agent that a difference of that share of"
-        f' the scale would need; "more cases" where more runs do not help (up to {MAX_REPEATS} were tried); a'
+        " interval, median over pairs, in returns and as a share of the random-to-best scale. Of a true difference of"
+        " that size, every second interval excludes 0. Repeats: runs of each agent that a difference of that share of"
+        f" the scale would need, at least {least_runs(ALPHA)}, as fewer cannot be significant;"
+        f' "more cases" where more runs do not help (up to {MAX_REPEATS} were tried); a'
         " dash with one run a cell, which does not show how runs vary. Mean of all: of the normalised scores"
         " over the environments, which are fixed."
         + (

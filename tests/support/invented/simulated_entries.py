@@ -13,12 +13,11 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from evopolicy_common.statistics.distributions import t_quantile
-from evopolicy_common.statistics.intervals import Estimate, difference, mean, of_runs
-from evopolicy_common.statistics.resampling import RESAMPLES
+from evopolicy_common.statistics.intervals import RESAMPLES, Estimate
 from evopolicy_results.scoring.scores import Cell, RunReturns, Scale
 from evopolicy_results.statistics.aggregates import Bounded, aggregates
-from evopolicy_results.statistics.pairs import Spread, pairs, repeats_needed, standard_error
+from evopolicy_results.statistics.intervals import difference, mean, of_runs, t_quantile
+from evopolicy_results.statistics.pairs import Spread, exchange_test, pairs, repeats_needed, standard_error
 from evopolicy_results.statistics.standings import standings
 
 Floats = NDArray[np.float64]
@@ -111,7 +110,19 @@ CASE_SHAPES: Mapping[str, Callable[[Generator, int], tuple[Floats, Floats, float
 """Returns of two checkpoints on the same cases, and the true gap."""
 
 
+SOLVED: Mapping[str, tuple[float, float]] = {
+    f"solved in {share:g} of runs, effect {effect:g}": (share, effect)
+    for share in (0.3, 0.5, 0.7)
+    for effect in (1.0, 3.0)
+}
+"""Agents that solve a task in a share of their runs, which are then better by an effect, in standard deviations of an
+episode."""
+
+
 def _run_effects(kind: str, g: Generator, n: int) -> Floats:
+    if kind in SOLVED:
+        share, effect = SOLVED[kind]
+        return effect * ((g.random(n) < share) - share)
     if kind == "skewed":
         return g.exponential(0.5, n) - 0.5
     if kind == "found or not":
@@ -130,14 +141,15 @@ def _by_logit(g: Generator, n_runs: int, n_cases: int, case: Floats, shift: floa
 def runs_of(
     kind: str, g: Generator, n_runs: int, n_cases: int, gap: float = 0.5
 ) -> tuple[Floats, Floats, float]:
-    """Matrices runs × cases of two agents; agents differ by case, and runs of an agent differ."""
+    """Matrices runs × cases of two agents; runs of an agent differ, and agents differ by case unless they are of
+    `SOLVED`."""
     case = g.normal(0, 1, n_cases)
     if kind == "0/1":
         one, other = (_by_logit(g, n_runs, n_cases, case, shift) for shift in (1.0, 0.0))
         return one, other, _LOGIT_GAP
 
     def agent(mean: float) -> Floats:
-        by_case = case + g.normal(0, 0.5, n_cases)
+        by_case = case + g.normal(0, 0.5 * (kind not in SOLVED), n_cases)
         return mean + _run_effects(kind, g, n_runs)[:, None] + by_case + g.normal(0, 1, (n_runs, n_cases))
 
     return agent(gap), agent(0.0), gap
@@ -194,6 +206,10 @@ class World(msgspec.Struct, frozen=True, kw_only=True):
     n_cases: int = 32
     shape: str = "normal"
     """`normal`, `skewed` (exponential), or `0/1` (thresholds at the normal values)."""
+    solved: tuple[float, ...] = (1.0,)
+    """Share of an entry's runs that solve the task; repeated. All entries have the same mean."""
+    effect: float = 0.0
+    """By how much a run that solves the task is better than one that does not."""
 
     @property
     def names(self) -> list[str]:
@@ -223,6 +239,9 @@ class World(msgspec.Struct, frozen=True, kw_only=True):
                 noise = self.noise[number % len(self.noise)]
                 own = noise * (self.run * drawn(n, 1) * (n > 1) + drawn(n, self.n_cases))
                 found[name, env] = level + case + self.interaction * drawn(self.n_cases) + own
+                if self.effect:
+                    share = self.solved[number % len(self.solved)]
+                    found[name, env] += self.effect * ((g.random((n, 1)) < share) - share)
                 if self.shape == "0/1":
                     found[name, env] = (found[name, env] > 0.0).astype(np.float64)
         return found
@@ -333,6 +352,11 @@ def mean_coverage(n_runs: int, shape: str, trials: int, *, seed: int = 0) -> Rat
     """How often the interval of one entry's mean on 32 cases holds the true mean."""
     g = np.random.default_rng(seed)
     world = World(n_runs=(n_runs,), interaction=0.5, n_entries=1, n_environments=1, shape=shape)
+    if shape in SOLVED:
+        share, effect = SOLVED[shape]
+        world = World(
+            n_runs=(n_runs,), run=0.0, n_entries=1, n_environments=1, solved=(share,), effect=effect
+        )
     true = 0.5 if shape == "0/1" else 0.0
 
     def trial() -> bool | None:
@@ -405,9 +429,9 @@ def half_width(spread: Spread, n: int) -> float:
 
 
 def resolved(n_runs: int, trials: int, *, level: float = 0.05, seed: int = 0) -> Rate:
-    """How often a true gap as large as the smallest difference of `n_runs` runs is resolved; for 0 runs, a gap of 1
-    with the runs that it needs at `level`."""
-    g = np.random.default_rng(seed)
+    """How often the interval of a true gap as large as the smallest difference of `n_runs` runs excludes 0; for 0 runs,
+    how often both tests resolve a gap of 1 at `level`, with the runs that it needs."""
+    g, is_planned = np.random.default_rng(seed), n_runs == 0
     spread = Spread(run=0.5**2 + 1.0 / 32, case=2 * 0.5**2 / 32, n_cases=32)
     if n_runs:
         gap = half_width(spread, n_runs)
@@ -419,7 +443,8 @@ def resolved(n_runs: int, trials: int, *, level: float = 0.05, seed: int = 0) ->
     def trial() -> bool:
         one, other, _ = runs_of("normal", g, n_runs, 32, gap)
         found = difference(one, other)
-        return found.p is not None and found.p <= level and found.value > 0.0
+        exchange = exchange_test(one.mean(axis=1), other.mean(axis=1)) if is_planned else 0.0
+        return found.p is not None and max(found.p, exchange) <= level and found.value > 0.0
 
     return rated(trial() for _ in range(trials))
 

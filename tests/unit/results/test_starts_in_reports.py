@@ -21,7 +21,7 @@ OTHER = Start(run="r-1", submit_index=4, tree="cd" * 32)
 
 
 def played(root: Path, heldout: list[float], **more: Any) -> None:
-    version = Version(policy(gain=0.5), returns=[1.0, 2.0], val=heldout[0])
+    version = Version(policy(gain=heldout[0]), returns=[1.0, 2.0], val=heldout[0])
     write_run(root, [version], heldout=heldout, **more)
 
 
@@ -60,7 +60,7 @@ def test_starts_from_one_state_are_paired_by_case_with_an_interval(found: Study)
     assert (pair.first, pair.second, pair.n_runs, pair.n_cases) == ("A", "B", (3, 3), 32)
     assert pair.gap.value == pytest.approx(-28.0)
     assert pair.gap.low < -28.0 < pair.gap.high
-    assert pair.verdict == "second"
+    assert (pair.verdict, pair.n_needed) == ("too few runs", 4)
     assert (other.pairs, other.variants) == ((), {"B": 1})
     rows = starts(found).rows
     assert [(row["start"], row["scored"]) for row in rows] == [

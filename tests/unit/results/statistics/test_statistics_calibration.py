@@ -19,7 +19,7 @@ from invented.simulated_entries import (
     runs_of,
 )
 
-from evopolicy_common.statistics.intervals import components
+from evopolicy_results.statistics.intervals import components
 
 TRIALS = 300
 # Four standard errors of a share of 0.95 in 300 trials are 5 %.
@@ -64,6 +64,23 @@ def test_agents_that_differ_by_case_are_told_apart_as_rarely_as_stated(
     assert found.holm.share <= 0.19
     assert found.ties.share <= 0.19
     assert found.raw.share <= 0.07
+
+
+@pytest.mark.parametrize("effect", [3.0, pytest.param(1.0, marks=pytest.mark.system)])
+@pytest.mark.parametrize("n_runs", [2, 3, pytest.param(4, marks=pytest.mark.system), 7])
+def test_agents_that_solve_a_task_in_some_runs_are_told_apart_as_rarely_as_stated(
+    n_runs: int, effect: float
+) -> None:
+    """A few runs that agree by chance leave no variance between runs."""
+    found = false_gaps(World(n_runs=(n_runs,), run=0.0, solved=(0.5,), effect=effect), 40)
+    assert found.holm.share <= 0.19
+    assert found.ties.share <= 0.19
+
+
+def test_agents_that_solve_a_task_in_some_runs_are_told_apart_rarely_without_a_family() -> None:
+    """Four runs of two agents on one environment reach the level, and must not exceed it."""
+    world = World(n_runs=(4,), run=0.0, solved=(0.5,), effect=3.0, n_entries=2, n_environments=1)
+    assert false_gaps(world, TRIALS).holm.share <= 0.05 + SLACK
 
 
 @pytest.mark.parametrize("shape", ["normal", "0/1"])

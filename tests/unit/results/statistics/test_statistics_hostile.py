@@ -19,12 +19,12 @@ from invented.run_dirs import write_run
 from invented.simulated_entries import World, observed_scores, suite_samples
 from invented.study import write_suite
 
-from evopolicy_common.statistics.distributions import holm
 from evopolicy_common.statistics.intervals import TOO_FEW_CASES
 from evopolicy_results.notebook import figures_of, tables_of
 from evopolicy_results.scoring.paper import heldout_returns
 from evopolicy_results.scoring.scores import Cell, RunReturns, Scale
 from evopolicy_results.statistics.aggregates import NO_SCALE, Aggregate, aggregates
+from evopolicy_results.statistics.intervals import holm
 from evopolicy_results.statistics.pairs import (
     NO_COMMON_CASES,
     NO_RETURNS,
@@ -100,18 +100,35 @@ def test_one_run_compares_checkpoints_and_several_compare_agents() -> None:
     assert (one.compares, one.verdict, one.gap.over) == ("checkpoints", "first", "cases")
     assert pair_of(repeated("A", 4, 3.0), single).compares == "checkpoints"
     fixed = pair_of(repeated("A", 4, 3.0), entry("R", run(*rising(32)), is_fixed=True))
-    assert (fixed.compares, fixed.gap.over) == ("agents", "runs and cases")
+    assert (fixed.compares, fixed.gap.over, fixed.p_exchange) == ("checkpoints", "cases", None)
+    several = pair_of(repeated("A", 4, 30.0), repeated("B", 4, 0.0))
+    assert (several.compares, several.gap.over) == ("agents", "runs and cases")
+    assert (several.verdict, several.p_exchange) == ("first", pytest.approx(2 / 70))
 
 
 def test_too_few_cases_and_too_few_runs_are_said() -> None:
     found = pair_of(entry("A", run(2.0, 3.0)), entry("B", run(1.0, 1.5)))
     assert (found.gap.low, found.gap.reason, found.verdict) == (None, TOO_FEW_CASES, "not comparable")
-    # Two runs each: no exchange of runs can be rarer than one in three.
+    # Two runs each: no exchange of runs can be rarer than one in three, however far apart they are.
     few = pair_of(repeated("A", 2, 50.0), repeated("B", 2, 0.0, 0.1))
-    assert (few.verdict, few.p_these_cases) == ("first", pytest.approx(1 / 3))
+    assert few.p < 0.05 < few.p_exchange == pytest.approx(1 / 3)
+    assert (few.verdict, few.n_needed) == ("too few runs", 4)
     noisy = pair_of(repeated("A", 2, 2.0, 3.0), repeated("B", 2, 0.0, 3.0))
-    assert noisy.verdict == "not told apart"
+    assert noisy.verdict == "too few runs"
     assert 5 <= noisy.n_needed <= 40
+    same = [repeated(name, 4, 0.0, 3.0) for name in ("A", "B")]
+    assert pair_of(*same).verdict == "not told apart"
+
+
+def test_runs_that_would_do_follow_from_the_whole_family() -> None:
+    """Four runs reach the level of one comparison, not that of three environments; there five would do."""
+    envs = ["a", "b", "c"]
+    cells = [repeated(name, 4, shift) for name, shift in (("A", 50.0), ("B", 0.0))]
+    samples = together(*(msgspec.structs.replace(cell, env=env) for cell in cells for env in envs))
+    for n, verdict in ((3, "too few runs"), (1, "first")):
+        found = pairs(samples, ["A", "B"], envs[:n])
+        assert {one.verdict for one in found} == {verdict}
+        assert {one.n_needed for one in found} == {5 if n == 3 else None}
 
 
 def test_identical_returns_have_no_spread_and_no_gap() -> None:
@@ -231,6 +248,7 @@ def test_a_verdict_never_contradicts_the_interval_beside_it(world: World, seed: 
         assert (pair.p is not None and pair.p <= 0.05) == excluded
         if pair.verdict in ("first", "second"):
             assert excluded
+            assert pair.p_exchange is None or pair.p_exchange <= 0.05
             assert (gap.value > 0.0) == (pair.verdict == "first")
             assert pair.n_needed is None
     if world.n_environments == 1:
@@ -319,9 +337,7 @@ def test_report_of_repeats_compares_agents_and_tells_repeats(tmp_path: Path) -> 
         ("agents", "runs and cases", "crossed t")
     }
     verdicts = {row["told_apart"] for row in agents}
-    assert any(
-        re.fullmatch(r"not distinguishable with 3 runs; about \d+ would be needed", v) for v in verdicts
-    )
+    assert any(re.fullmatch(r"too few runs to tell with 3; about \d+ would do", v) for v in verdicts)
     assert all(row["repeats_0_2"] for row in table_named(tables, "resolution_core16").rows)
 
 

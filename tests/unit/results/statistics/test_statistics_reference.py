@@ -8,12 +8,14 @@ import math
 import numpy as np
 import pytest
 from invented.simulated_entries import half_width
+from scipy.stats import permutation_test
 
-from evopolicy_common.statistics.distributions import holm, t_quantile
-from evopolicy_common.statistics.intervals import difference, of_runs, over_cases
+from evopolicy_common.statistics.intervals import over_cases
 from evopolicy_results.scoring.scores import Cell, RunReturns, Scale
+from evopolicy_results.statistics import pairs
 from evopolicy_results.statistics.aggregates import TAUS, aggregates, iqm, probability_of_improvement, profile
-from evopolicy_results.statistics.pairs import Spread, label_test, repeats_needed
+from evopolicy_results.statistics.intervals import difference, holm, of_runs, t_quantile
+from evopolicy_results.statistics.pairs import Spread, exchange_test, least_runs, repeats_needed
 
 A = np.array([[0.1, 0.9, 0.35], [0.2, 0.7, 0.5], [0.15, 1.1, 0.45], [0.05, 0.8, 0.65], [0.3, 0.95, 0.2]])
 B = np.array([[0.12, 0.6, 0.55], [0.25, 0.65, 0.5], [0.1, 0.75, 0.7], [0.2, 0.85, 0.4]])
@@ -63,36 +65,26 @@ def test_stratified_bootstrap_intervals_are_those_of_rliable() -> None:
     assert (a.n_runs, a.n_environments, a.over) == (15, 3, "runs")
 
 
-@pytest.mark.parametrize(
-    ("p", "df", "value"),
-    [
-        (0.975, 1, 12.706204736174694),
-        (0.975, 2.5, 3.5746548420036817),
-        (0.975, 9, 2.262157162798205),
-        (0.975, 31, 2.039513446396408),
-        (0.9, 4, 1.533206274058944),
-        (0.995, 200, 2.600634436191558),
-        (0.975, math.inf, 1.959963984540054),
-    ],
-)
-def test_t_quantiles_are_those_of_scipy(p: float, df: float, value: float) -> None:
-    assert t_quantile(p, df) == pytest.approx(value, rel=1e-9)
+def _mean_gap(first: np.ndarray, second: np.ndarray, axis: int) -> np.ndarray:
+    return np.abs(first.mean(axis=axis) - second.mean(axis=axis))
 
 
-def test_t_quantile_refuses_what_it_cannot_tell() -> None:
-    for p, df in ((0.4, 3.0), (1.0, 3.0), (0.975, 0.0), (0.975, math.nan)):
-        with pytest.raises(ValueError, match="t quantile"):
-            t_quantile(p, df)
+@pytest.mark.parametrize(("n_first", "n_second"), [(2, 2), (2, 7), (3, 4), (6, 6)])
+def test_the_exchange_of_runs_is_the_exact_permutation_test_of_scipy(n_first: int, n_second: int) -> None:
+    generator = np.random.default_rng(n_first)
+    for values in (generator.normal(size=9 + 3), generator.integers(0, 2, 12).astype(float), np.ones(12)):
+        first, second = values[:n_first], values[n_first : n_first + n_second]
+        expected = permutation_test((first, second), _mean_gap, n_resamples=10_000, alternative="greater")
+        assert exchange_test(first, second) == pytest.approx(expected.pvalue)
 
 
-def test_exact_permutation_tests_are_those_of_scipy() -> None:
-    assert label_test([1.0, 2.0, 3.0, 7.0], [2.0, 6.0, 8.0, 9.0, 5.0]) == pytest.approx(1 / 6)
-    assert label_test([1.0, 2.0], [3.0, 4.0]) == pytest.approx(1 / 3)
-
-
-def test_random_patterns_count_the_observed_one() -> None:
-    found = label_test(list(map(float, range(10))), [value + 100.0 for value in range(10)], 999)
-    assert found == 1e-3
+def test_many_runs_are_exchanged_by_the_normal_approximation(monkeypatch: pytest.MonkeyPatch) -> None:
+    values = np.random.default_rng(0).normal(size=40) + np.repeat([1.0, 0.0], 20)
+    exact = exchange_test(values[:20], values[20:])
+    assert 0.001 < exact < 0.2
+    monkeypatch.setattr(pairs, "MAX_EXCHANGED", 39)
+    assert exchange_test(values[:20], values[20:]) == pytest.approx(exact, rel=0.3)
+    assert exchange_test(np.ones(30), np.ones(30)) == 1.0
 
 
 def test_welch_interval_of_run_scores_is_that_of_scipy() -> None:
@@ -137,6 +129,8 @@ def test_repeats_are_the_fewest_whose_interval_is_narrow_enough() -> None:
         n = repeats_needed(spread, gap)
         assert half_width(spread, n) <= gap < half_width(spread, n - 1)
     assert repeats_needed(spread, 0.19) is None  # the cases alone leave ±0.2
-    assert repeats_needed(Spread(run=0.0, case=0.0, n_cases=32), 0.1) == 2
+    # No exchange of three runs each is as rare as 5 %.
+    assert repeats_needed(Spread(run=0.0, case=0.0, n_cases=32), 0.1) == least_runs(0.05) == 4
+    assert [least_runs(level) for level in (0.34, 0.1, 0.05 / 48, 0.05 / 160)] == [2, 3, 7, 8]
     with pytest.raises(ValueError, match="above 0"):
         repeats_needed(spread, 0.0)

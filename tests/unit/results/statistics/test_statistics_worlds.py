@@ -12,8 +12,8 @@ from invented.run_dirs import write_run
 
 from evopolicy_common.catalogue.anchors import anchor
 from evopolicy_common.catalogue.worlds import ids
-from evopolicy_common.statistics.intervals import mean, of_runs, stratified, stratum, stratum_of
 from evopolicy_results.report import write_report
+from evopolicy_results.statistics.intervals import mean, of_runs, stratified, stratum, stratum_of
 from evopolicy_results.studies.study import study
 from evopolicy_results.tables.report_tables import tables_of
 
