@@ -225,8 +225,8 @@ class SplitSource:
                 key = hmac.digest(self._secret, f"hidden cases of run {own}".encode(), "sha256")
                 shared = {case.seed for members in cases.values() for case in members}
                 cases = {**derive(key, suite, env, counts, shared), "train": cases["train"]}
-            key, trials = self._key(env)
-            cases = in_world(env, key, cases)
+            world, trials = self._key(env)
+            cases = in_world(env, world, cases)
             epoch = epoch_of(self._secret)
             return EnvironmentSplits(env=env, secret=True, epoch=epoch, files={}, trials=trials, **cases)
         if own:
