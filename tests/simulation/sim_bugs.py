@@ -217,14 +217,6 @@ BUGS = (
     ),
     Bug("take siblings for strangers", CaseSets, "join", "(env, case.seed,", "(len(self._known), case.seed,"),
     Bug("forget permits at a restart", permits, "load", "row.ended_at is not None", "True", seed=13),
-    Bug(
-        "take a lease on its way for one that was let go of",
-        occupancies,
-        "surely",
-        "if settled == 0:",
-        "if True:",
-        seed=200,
-    ),
     Bug("forget what a silent worker may still play", occupancies, "vacate", "if sure:", "if True:", seed=19),
     Bug(
         "take all kernels for free after a restart",

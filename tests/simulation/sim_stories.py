@@ -85,7 +85,9 @@ STORIES = (
     Story(title="runs resume on another kernel during scoring", reboots=(25.0, 60.0), thinks_s=3.0),
     Story(
         title="restarts while a submit and hidden cases wait",
-        workers=(("1", 1, 0),),
+        opened_s=(0.0, 8.0, 16.0, 24.0, 32.0),
+        lengths=2.0,
+        workers=(("1", 2, 0),),
         restarts=(15.0, 30.0, 45.0),
         remote=True,
     ),
