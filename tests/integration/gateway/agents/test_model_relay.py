@@ -311,7 +311,9 @@ def test_a_recorded_agent_replays_to_the_byte_without_its_model(
     assert "You are somebody else." in out
 
 
-@pytest.mark.parametrize("api_name", ["responses", pytest.param("messages", marks=pytest.mark.system)])
+@pytest.mark.parametrize(
+    "api_name", ["responses", "gemini", pytest.param("messages", marks=pytest.mark.system)]
+)
 def test_a_run_with_reasoning_replays_to_the_byte_over_each_api(
     tmp_path: Path, operator: Path, api_name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
