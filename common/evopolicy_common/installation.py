@@ -13,8 +13,8 @@ from pathlib import Path
 
 COMMANDS = (
     "accept-worlds|backup|certs|check|check-env|countersign|data|demo|diff|disk|doctor|envs|epoch|export|files"
-    "|finish|gc|harbor|identity|leaderboard|local|publish|random|replay|report|rescore|router-config|run|runs"
-    "|schema|setup|status|suite|texts|try|verify|web|workers"
+    "|finish|gc|harbor|identity|leaderboard|local|publish|replay|report|rescore|router-config|run|runs"
+    "|setup|status|suite|try|verify|web|workers"
 )
 """First words of our programs' commands, as a pattern."""
 # A program is followed by a command, an option or a value's name. Help is general, and `there:` is another machine.
