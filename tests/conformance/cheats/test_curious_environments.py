@@ -109,6 +109,7 @@ LINKS = {
     "whole/folder": "../../operator",
     "x.libs": "../operator",
     "stolen.py": "../operator/secret",
+    "beside.py": "token.txt",
     "stolen": "../operator",
     "plan.dat": "../operator/secret",
 }

@@ -4,11 +4,11 @@ A folder on the module search path may hold anything besides: run directories wi
 Shown are its modules, packages, and metadata of installed packages, without names that begin with a dot, key files, run
 directories and state folders, also inside packages and declared folders.
 
-A link is shown if it leads to a file of its own package (or of the folder, for a module that is a file) to which these
-rules apply in the same way; a link to a folder is never followed. In a folder that is shown as a whole, links stay
-links, whose targets do not exist in the jail unless they are shown, too. A hard link is a file like any other: git and
-archives make none to files outside, and Linux none to files that their maker may not write (fs.protected_hardlinks). A
-bind mount, which only root can make, is shown as the folder that it is.
+A link is shown if it leads to a file of its own package (for a module that is one file, to a module in the same folder)
+to which these rules apply in the same way; a link to a folder is never followed. In a folder that is shown as a whole,
+links stay links, whose targets do not exist in the jail unless they are shown, too. A hard link is a file like any
+other: git and archives make none to files outside, and Linux none to files that their maker may not write
+(fs.protected_hardlinks). A bind mount, which only root can make, is shown as the folder that it is.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ def modules(folder: str) -> list[str]:
     """Paths of what is shown of a folder on the module search path, which need not exist."""
     shown: list[str] = []
     for entry in _entries(folder):
-        if entry.name.endswith(_MODULES) and _is_file(entry, folder):
+        if entry.name.endswith(_MODULES) and _is_module(entry.path):
             shown.append(entry.path)
         elif entry.is_dir(follow_symlinks=False) and (
             entry.name.endswith(_INSTALLED) or any(os.path.exists(f"{entry.path}/{name}") for name in _INIT)
@@ -48,10 +48,10 @@ def content(path: str, package: str = "") -> list[str]:
     """The paths that are shown of a file or folder: the folder itself if nothing in it is hidden. Raises
     SandboxError where that are too many files.
 
-    `package`: the folder to which a file belongs; by default the one in which it is.
+    `package`: the folder to which a file belongs; without one, it is a module of its folder.
     """
     if not os.path.isdir(path):
-        return [path] if _is_shown(path, package or os.path.dirname(path)) else []
+        return [path] if (_is_shown(path, package) if package else _is_module(path)) else []
     if os.path.islink(path):
         return []
     shown, whole = _content(path, path)
@@ -125,6 +125,15 @@ def _is_shown(path: str, package: str) -> bool:
             return False
         folder = f"{folder}/{part}"
     return True
+
+
+def _is_module(path: str) -> bool:
+    """Whether the path is a module that is one file, or a link to one in the same folder."""
+    if os.path.isfile(path) and not os.path.islink(path):
+        return True
+    real, folder = os.path.realpath(path), os.path.dirname(path)
+    beside = os.path.dirname(real) == os.path.realpath(folder) and real.endswith(_MODULES)
+    return beside and _is_shown(path, folder)
 
 
 def _is_file(entry: os.DirEntry[str], package: str) -> bool:
