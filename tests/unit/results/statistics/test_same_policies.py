@@ -77,7 +77,7 @@ def test_equal_repeats_have_no_interval_over_runs_anywhere() -> None:
     assert standings(samples, {"A": 1.0, "B": 0.0}, ["env"]).over == "cases"
 
 
-def test_a_repeated_policy_among_others_counts_in_the_mean_and_once_in_the_variance() -> None:
+def test_a_repeated_policy_counts_in_the_mean_and_once_in_the_variance() -> None:
     several = cell("A", "a", "a", "a", "b")
     kept = returns_in(several)
     assert kept.shape == (2, 32)

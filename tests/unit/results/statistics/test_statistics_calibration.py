@@ -68,16 +68,14 @@ def test_agents_that_differ_by_case_are_told_apart_as_rarely_as_stated(
 
 @pytest.mark.parametrize("effect", [3.0, pytest.param(1.0, marks=pytest.mark.system)])
 @pytest.mark.parametrize("n_runs", [2, 3, pytest.param(4, marks=pytest.mark.system), 7])
-def test_agents_that_solve_a_task_in_some_runs_are_told_apart_as_rarely_as_stated(
-    n_runs: int, effect: float
-) -> None:
+def test_agents_that_solve_a_task_sometimes_are_rarely_told_apart(n_runs: int, effect: float) -> None:
     """A few runs that agree by chance leave no variance between runs."""
     found = false_gaps(World(n_runs=(n_runs,), run=0.0, solved=(0.5,), effect=effect), 40)
     assert found.holm.share <= 0.19
     assert found.ties.share <= 0.19
 
 
-def test_agents_that_solve_a_task_in_some_runs_are_told_apart_rarely_without_a_family() -> None:
+def test_four_runs_in_a_single_comparison_are_rarely_told_apart() -> None:
     """Four runs of two agents on one environment reach the level, and must not exceed it."""
     world = World(n_runs=(4,), run=0.0, solved=(0.5,), effect=3.0, n_entries=2, n_environments=1)
     assert false_gaps(world, TRIALS).holm.share <= 0.05 + SLACK
