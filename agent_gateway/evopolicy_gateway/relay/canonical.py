@@ -126,9 +126,10 @@ def difference(recorded: Any, now: Any) -> str:
     )
     pairs = enumerate(itertools.zip_longest(ours, theirs))
     first = max(0, next((n for n, (one, other) in pairs if one != other), 0) - _CONTEXT)
-    shown = [side[first : first + MAX_LINES] for side in (ours, theirs)]
+    # Half of them from each side, so that both are seen where every line differs.
+    shown = [side[first : first + MAX_LINES // 2] for side in (ours, theirs)]
     names = [f"{side}, from line {first + 1:,}" for side in ("recorded", "now")]
     diff = difflib.unified_diff(shown[0], shown[1], names[0], names[1], n=_CONTEXT, lineterm="")
     lines = [line[:400] for line in diff]
-    left = max(len(ours), len(theirs)) - first - MAX_LINES
+    left = max(len(ours), len(theirs)) - first - MAX_LINES // 2
     return "\n".join(lines[:MAX_LINES] + [f"… {left:,} more lines"] * (left > 0))

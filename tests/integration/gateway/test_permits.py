@@ -64,7 +64,7 @@ async def test_nothing_is_served_before_the_permit_and_the_operator_hears_why(tm
         gateway, events = quiet(folder)
         task = asyncio.create_task(gateway.run())
         await until(lambda: events)
-        assert set(events) == {"hidden cases on this machine to be postponed"}
+        assert set(events) == {"hidden cases of another run to be scored"}
         assert not folder.workspace.exists()
         double.scoring.clear()
         await until(lambda: len(events) > 1 and events[-2] == "")

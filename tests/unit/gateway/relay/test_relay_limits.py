@@ -91,7 +91,7 @@ def test_many_answers_to_one_request_do_not_exceed_the_limit(
     assert "50 answers may exceed the limit of 1,000,000 tokens" in answer.text
 
 
-def test_a_request_that_ran_out_of_time_is_charged_for_all_that_it_may_have_used(tmp_path: Path) -> None:
+def test_a_request_that_ran_out_of_time_is_charged_its_reserve(tmp_path: Path) -> None:
     script = [Step(odd=odd_answers.hang(1.0))]
     (answer,), served = asked(tmp_path, script, {"max_completion_tokens": 5000}, timeout_s=0.3)
     assert answer.status_code == 502
@@ -121,7 +121,7 @@ def test_an_answer_above_its_reserve_makes_the_next_reserves_larger(tmp_path: Pa
         ("responses", {"Service_Tier": "flex"}),
     ],
 )
-def test_a_service_tier_without_a_price_is_refused_where_the_cost_is_limited(
+def test_a_tier_without_a_price_is_refused_under_a_cost_limit(
     tmp_path: Path, path: str, tier: dict[str, str]
 ) -> None:
     for n, (prices, status) in enumerate(
