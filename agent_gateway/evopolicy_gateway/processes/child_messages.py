@@ -300,6 +300,14 @@ class Child(ChildProcess):
         while data := await self._process.stdout.readline():
             yield event_of(data)
 
+    async def finish(self, grace_s: float) -> None:
+        """Ends its orders, and waits for at most this time until it has ended by itself, in seconds."""
+        if self._process.stdin is not None:
+            self._process.stdin.close()
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(grace_s):
+                await self.ended()
+
     async def tell(self, order: Order) -> None:
         """Sends an order; dropped when the child is gone."""
         stdin = self._process.stdin

@@ -89,6 +89,9 @@ class ModelRelay(Kept):
 
     async def end(self, grace_s: float) -> None:
         self._sock.close()
+        if self._child is not None:
+            # SIGTERM ends its jail with everything in it. It counts the answers that still come, and ends.
+            await self._child.finish(grace_s)
         await super().end(grace_s)
         plan, used = self._run.plan, ledger.read(self._run.folder.model_requests)
         config = plan.known_config
