@@ -82,24 +82,14 @@ def described(results: Results, card: cards.Card) -> Forger:
     return forger
 
 
-def test_a_changed_card_is_refused_and_a_narrower_interval_too(results: Results) -> None:
+def test_a_changed_card_is_refused_and_an_invented_interval_too(results: Results) -> None:
     assert states(checked(results, Forger(results.files))) == ["ok"]
     card = card_of(results)
     cell = card.results[0]
-    assert cell.low is not None
-    assert cell.high is not None
-    width = cell.high - cell.low
-    for low, state in ((cell.low + 0.01 * width, "ok"), (cell.low + 0.1 * width, "failed")):
-        changed = (msgspec.structs.replace(cell, low=low), *card.results[1:])
-        forger = described(results, msgspec.structs.replace(card, results=changed))
-        assert set(states(checked(results, forger))) == {state}
-    for name in (contents.CARD_TEXT, contents.CROISSANT):
-        forger = Forger(results.files)
-        forger.files[name] = forger.files[name].replace(b"runs", b"ruins", 1)
-        assert states(checked(results, forger)) == ["failed"]
-    forger = Forger(results.files)
-    del forger.files[contents.CARD_TEXT]
-    assert states(checked(results, forger)) == ["failed"]
+    assert (cell.low, cell.high) == (None, None)  # all runs returned one policy, and there are few cases
+    changed = (msgspec.structs.replace(cell, low=-1e3, high=1e3), *card.results[1:])
+    forger = described(results, msgspec.structs.replace(card, results=changed))
+    assert set(states(checked(results, forger))) == {"failed"}
 
 
 def test_a_card_of_another_version_is_a_claim(results: Results) -> None:
