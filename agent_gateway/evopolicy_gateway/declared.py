@@ -133,7 +133,7 @@ def literals(kind: Any) -> tuple[Any, ...]:
 def _path(kind: type, value: Any) -> Any:
     if kind is Path:
         return Path(value)
-    raise NotImplementedError(kind)
+    raise TypeError(f"no setting of type {kind} is read from a text")
 
 
 def suite_keys(options: type[msgspec.Struct]) -> list[tuple[str, Any, None]]:
