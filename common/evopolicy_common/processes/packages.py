@@ -161,8 +161,26 @@ def _distribution(name: str) -> metadata.Distribution | None:
     try:
         return metadata.distribution(name)
     except metadata.PackageNotFoundError:
-        owners = metadata.packages_distributions().get(name)
-        return metadata.distribution(owners[0]) if owners else None
+        owner = distribution_of(name)
+        return metadata.distribution(owner) if owner else None
+
+
+@functools.cache
+def distribution_of(module: str) -> str:
+    """Name of the first installed distribution with that top-level module; empty if there is none.
+
+    The same as `metadata.packages_distributions` has, which makes paths of all installed files: seconds.
+    """
+    for distribution in metadata.distributions():
+        if tops := distribution.read_text("top_level.txt"):
+            modules = set(tops.split())
+        else:
+            lines = (distribution.read_text("RECORD") or "").splitlines()
+            paths = (line.strip('"').partition(",")[0] for line in lines)
+            modules = {path.partition("/")[0].removesuffix(".py") for path in paths if path.endswith(".py")}
+        if module in modules:
+            return distribution.metadata["Name"]
+    return ""
 
 
 def _requires(distribution: metadata.Distribution) -> list[str]:

@@ -129,10 +129,10 @@ REFUSED = {
     "leave": "environment acme/Bad, step 0: it raised SystemExit: no more levels; it has to take any action",
     "interrupt": "environment acme/Bad, step 0: it raised KeyboardInterrupt",
     "raise in reset, later": "environment acme/Bad, reset: it raised RuntimeError: no level of that seed",
-    "hang": "environment acme/Bad, step 0: it has not returned for 4 s",
-    "hang in make": "environment acme/Bad, make: it has not returned for 4 s",
-    "hang in close": "environment acme/Bad, close: it has not returned for 4 s",
-    "hold": "environment acme/Bad, make, reset or step: it has not returned for 4 s",
+    "hang": "environment acme/Bad, step 0: it has not returned for 8 s",
+    "hang in make": "environment acme/Bad, make: it has not returned for 8 s",
+    "hang in close": "environment acme/Bad, close: it has not returned for 8 s",
+    "hold": "environment acme/Bad, make, reset or step: it has not returned for 8 s",
 }
 """A slot's error for an environment that is tried out."""
 
@@ -141,13 +141,13 @@ REFUSED = {
 def test_an_environment_that_breaks_its_description_is_refused(
     slots: Slots, how: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(slot_module, "SILENT_S", 8.0)
+    monkeypatch.setattr(slot_module, "SILENT_S", 16.0)
     why = REFUSED[how]
     how, later, _ = how.partition(", later")
     # After the trial, steps are timed in episodes of other seeds.
     kwargs = {"how": how, "seeds_from": 2 if later else 0}
     with (
-        slots.running(slot_of(slots, "Bad", Limits(call_s=4.0), kwargs=kwargs)) as slot,
+        slots.running(slot_of(slots, "Bad", Limits(call_s=8.0), kwargs=kwargs)) as slot,
         pytest.raises((WorkerError, SlotDiedError), match=why),
     ):
         slots.run(slot.describe(["acme/Bad"]))
@@ -173,10 +173,10 @@ WRONG = {
     "object reward": (
         r"environment acme/Bad, step 0, reward: it is <object .* \(object\); a reward has to be one number"
     ),
-    "hang": "environment acme/Bad, step 0: it has not returned for 4 s, the limit of one call; .*--env-timeout",
-    "hang in reset": "environment acme/Bad, reset: it has not returned for 4 s",
-    "hang in make": "environment acme/Bad, make: it has not returned for 4 s",
-    "hold": "environment acme/Bad, reset or step: it has not returned for 4 s",
+    "hang": "environment acme/Bad, step 0: it has not returned for 8 s, the limit of one call; .*--env-timeout",
+    "hang in reset": "environment acme/Bad, reset: it has not returned for 8 s",
+    "hang in make": "environment acme/Bad, make: it has not returned for 8 s",
+    "hold": "environment acme/Bad, reset or step: it has not returned for 8 s",
     "gorge": "environment acme/Bad, step 0: there is no memory left for it; .*--env-memory",
     "leak": "environment acme/Bad.* memory.*--env-memory",
     "custom space": "environment acme/Bad, observation_space: a space of type Opaque",
@@ -201,10 +201,10 @@ def test_what_prevents_an_episode_is_reported_by_name_and_is_nobodys_result(
     slots: Slots, how: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(slot_module, "_CHECK_S", 0.5)
-    monkeypatch.setattr(slot_module, "SILENT_S", 8.0)
+    monkeypatch.setattr(slot_module, "SILENT_S", 16.0)
     # Long enough for calls that return, also on a busy machine.
     limits = (
-        Limits(call_s=4.0)
+        Limits(call_s=8.0)
         if how.startswith(("hang", "hold"))
         else Limits(memory_bytes=320 << 20)
         if how == "leak"
@@ -229,8 +229,8 @@ def test_an_environment_that_hangs_on_actions_gives_no_second_throw(
     interpreter, for a second attempt or a run that never ends. Defence: its actions are in a file of
     the slot, and the next attempt plays them; in the fourth one the hang is its failure."""
     monkeypatch.setattr(slot_module, "_CHECK_S", 0.5)
-    monkeypatch.setattr(slot_module, "SILENT_S", 8.0)
-    slot = slot_of(slots, "Bad", Limits(call_s=4.0), kwargs={"how": f"{how} when pushed"})
+    monkeypatch.setattr(slot_module, "SILENT_S", 16.0)
+    slot = slot_of(slots, "Bad", Limits(call_s=8.0), kwargs={"how": f"{how} when pushed"})
     bundle = slots.bundle(LUCKY)
     job = make_job(env="acme/Bad", record="actions")
     stands: list[list[float]] = []
@@ -254,9 +254,9 @@ def test_an_environment_that_hangs_on_actions_gives_no_second_throw(
 
 
 def test_a_close_that_hangs_ends_the_process_at_the_next_episode(slots: Slots) -> None:
-    with slots.running(slot_of(slots, "Bad", Limits(call_s=4.0), kwargs={"how": "hang in close"})) as slot:
+    with slots.running(slot_of(slots, "Bad", Limits(call_s=8.0), kwargs={"how": "hang in close"})) as slot:
         assert slots.play_all(PUSHES, slot=slot, env="acme/Bad")[0].length == 8
-        with pytest.raises(WorkerError, match="environment acme/Bad, close: it has not returned for 4 s"):
+        with pytest.raises(WorkerError, match="environment acme/Bad, close: it has not returned for 8 s"):
             slots.play_all(PUSHES, slot=slot, env="acme/Bad")
         slots.run(slot.start())
         assert slots.play_all(PUSHES, slot=slot, env="acme/Bad")[0].length == 8

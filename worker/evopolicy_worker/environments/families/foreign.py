@@ -11,13 +11,14 @@ import os
 import sys
 from collections.abc import Mapping
 from functools import cache
-from importlib.metadata import packages_distributions, version
+from importlib.metadata import version
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 from evopolicy_common.catalogue import Entry
 from evopolicy_common.errors import WorkerError
+from evopolicy_common.processes.packages import distribution_of
 from evopolicy_worker.environments.families import miniwob
 from evopolicy_worker.environments.interface.calls import unreadable
 from evopolicy_worker.environments.interface.fingerprint import versions
@@ -111,5 +112,5 @@ def _own(top: str, data: tuple[str, ...] = ()) -> dict[str, str]:
             files = [path for path in files if path.name.endswith(_SOURCES)]
         for path in files[:_MAX_FILES]:
             digest.update(path.name.encode() + b"\0" + path.read_bytes() + b"\0")
-    name = packages_distributions().get(top, [""])[0]
+    name = distribution_of(top)
     return {(name or top).lower(): f"{version(name) if name else '0'}+src.{digest.hexdigest()[:12]}"}
