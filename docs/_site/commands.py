@@ -4,6 +4,7 @@ docs/reference/cli.md`."""
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Iterator
 from enum import Enum
 from typing import Any, Literal, get_args, get_origin
@@ -13,29 +14,66 @@ import typer
 from evopolicy_coordinator.cli.main import app as coordinator
 from evopolicy_gateway.cli.main import app as front
 from evopolicy_gateway.cli.serve import app as gateway
+from evopolicy_gateway.declared import SET, declared
+from evopolicy_gateway.jail.settings import JailSettings
+from evopolicy_gateway.run.run_options import ListenerOptions, RunOptions
 from evopolicy_worker.cli import app as worker
+
+OF_A_RUN = {
+    SET,
+    *(one.flag for each in (RunOptions, JailSettings, ListenerOptions) for one in declared(each).values()),
+}
+"""Options that `options.md` describes."""
+TABLE = "| option | meaning |\n|---|---|"
 
 
 def page() -> str:
-    """The page's Markdown."""
+    """The page's Markdown. A row that three commands or more have is in one table at its start, one for each option."""
     apps = {"": front, "-coordinator": coordinator, "-worker": worker, "-gateway": gateway}
-    parts = ["# Commands\n\nEvery command has `--help` with an example.\n"]
-    for name, app in apps.items():
-        parts += _described(f"evopolicy{name}", typer.main.get_command(app), 2)
+    trees = {f"evopolicy{name}": typer.main.get_command(app) for name, app in apps.items()}
+    found = [each for name, command in trees.items() for each in _commands(name, command, 2)]
+    rows = Counter(
+        (each.opts[0], _row(each))
+        for _, command, _ in found
+        for each in _options(command)
+        if not _of_a_run(command, each)
+    )
+    shared = {name: row for (name, row), times in reversed(rows.most_common()) if times > 2}.values()
+    parts = [
+        "# Commands\n\nEvery command has `--help` with an example. `evopolicy run`, `local`, and `suite` also have the"
+        " [options of a run](options.md). Several commands share these options:\n",
+        TABLE,
+        *sorted(shared),
+        "",
+    ]
+    for name, command, depth in found:
+        parts += [f"{'#' * depth} {name}\n", _text(command.help or "") + "\n"]
+        options = [each for each in _options(command) if not _of_a_run(command, each)]
+        if own := [_row(each) for each in options if _row(each) not in shared]:
+            parts += [TABLE, *own, ""]
+        if also := [f"`{each.opts[0]}`" for each in options if _row(each) in shared]:
+            parts.append(f"Also {', '.join(also)}.\n")
+        if of_a_run := [f"`{each.opts[0]}`" for each in _options(command) if _of_a_run(command, each)]:
+            parts.append(f"[Options of a run](options.md): {', '.join(of_a_run)}.\n")
     return "\n".join(parts)
 
 
-def _described(name: str, command: Any, depth: int) -> Iterator[str]:
-    yield f"{'#' * depth} {name}\n"
-    yield _text(command.help or "") + "\n"
-    options = [each for each in command.params if not getattr(each, "hidden", False) and each.name != "help"]
-    if options:
-        yield "| option | meaning |\n|---|---|"
-        for each in options:
-            yield f"| {_names(each)} | {_cell(each)} |"
-        yield ""
+def _commands(name: str, command: Any, depth: int) -> Iterator[tuple[str, Any, int]]:
+    yield name, command, depth
     for sub in sorted(getattr(command, "commands", {})):
-        yield from _described(f"{name} {sub}", command.commands[sub], min(depth + 1, 4))
+        yield from _commands(f"{name} {sub}", command.commands[sub], min(depth + 1, 4))
+
+
+def _options(command: Any) -> list[Any]:
+    return [each for each in command.params if not getattr(each, "hidden", False) and each.name != "help"]
+
+
+def _of_a_run(command: Any, option: Any) -> bool:
+    return command.name in ("run", "local", "suite") and option.opts[0] in OF_A_RUN
+
+
+def _row(option: Any) -> str:
+    return f"| {_names(option)} | {_cell(option)} |"
 
 
 def _names(option: Any) -> str:

@@ -1,6 +1,88 @@
 """Writes `docs/reference/files.md` from the files' types: `python docs/_site/files.py > docs/reference/files.md`."""
 
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import msgspec
+
 from evopolicy_gateway.cli import schemas
+from evopolicy_gateway.declared import declared
+from evopolicy_gateway.jail.settings import JailSettings
+from evopolicy_gateway.run.run_options import RunOptions
+from evopolicy_gateway.suite.suite_file import Override, RunTable
+
+HEAD = """# Files, field by field
+
+`evopolicy files schemas/NAME.schema.json` prints the JSON Schema of each of these files (draft 2020-12).
+A question mark follows a field that may be absent; its default is given unless it is empty, zero, false, or null.
+
+An editor with TOML schemas checks a suite file whose first line names its schema. Run
+`evopolicy files schemas/suite.toml.schema.json > suite.schema.json`, and begin the file with
+`#:schema ./suite.schema.json`.
+"""
+OF_A_RUN = {*declared(RunOptions), *declared(JailSettings)}
+"""Settings that `options.md` describes."""
+
+
+def page() -> Iterator[str]:
+    """The page's parts. A type is described where it first occurs."""
+    yield HEAD
+    done: set[type[msgspec.Struct]] = set()
+    for name in ("suite.toml", "agent.toml", "run.json", "summary.json", "suite.json"):
+        kind, described = schemas.KINDS[name], schemas.schema(name)["$defs"]
+        yield f"## {name}\n\n{kind.about} Version {kind.version}.\n"
+        later = kind.type in done
+        if later:
+            yield f"[{kind.type.__name__}](#{kind.type.__name__.lower()}) lists its fields.\n"
+        for struct in schemas.structs(kind.type):
+            if struct not in done:
+                done.add(struct)
+                yield from _struct(struct, described[struct.__name__], first=struct is kind.type)
+
+
+def _struct(struct: type[msgspec.Struct], described: dict[str, Any], *, first: bool) -> Iterator[str]:
+    if not first:
+        yield f"### {struct.__name__}\n\n{described.get('description', '')}\n"
+    fields, needed = dict(described["properties"]), described.get("required", ())
+    if struct is Override:
+        yield "It takes the keys of [RunTable](#runtable), and:\n"
+        fields = {name: one for name, one in fields.items() if name not in RunTable.__struct_fields__}
+    named = [f"`{name}`" for name in fields if struct in (RunTable, JailSettings) and name in OF_A_RUN]
+    if named:
+        yield f"[Options of a run](options.md) describes {', '.join(named)}.\n"
+    rows = [(name, one) for name, one in fields.items() if f"`{name}`" not in named]
+    if rows:
+        yield "| field | type | meaning |\n|---|---|---|"
+        for name, one in rows:
+            default = None if name in needed else one.get("default")
+            text, value = one.get("description", ""), msgspec.json.encode(default).decode()
+            if default and len(value) < 40:
+                text = f"{text} Default: `{value}`.".strip()
+            yield f"| `{name}`{'' if name in needed else '?'} | {_cell(_type_text(one))} | {_cell(text)} |"
+        yield ""
+
+
+def _cell(text: str) -> str:
+    return text.replace("|", "&#124;").replace("<", "&lt;").replace(">", "&gt;")
+
+
+def _type_text(described: dict[str, Any]) -> str:
+    """A schema's type in words, such as `string or null`."""
+    if "$ref" in described:
+        return str(described["$ref"].rpartition("/")[2])
+    if "anyOf" in described:
+        return " or ".join(_type_text(each) for each in described["anyOf"])
+    if "enum" in described:
+        return " or ".join(f"`{each}`" for each in described["enum"])
+    if described.get("type") == "array":
+        items: dict[str, Any] = described.get("items") or next(iter(described.get("prefixItems", ())), {})
+        return f"array of {_type_text(items)}" if items else "array"
+    if described.get("type") == "object" and isinstance(described.get("additionalProperties"), dict):
+        return f"object of {_type_text(described['additionalProperties']) or 'any'}"
+    return str(described.get("type", "any"))
+
 
 if __name__ == "__main__":
-    print(schemas.page())
+    print("\n".join(page()))

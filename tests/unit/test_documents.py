@@ -183,8 +183,10 @@ def test_messages_on_the_page_about_trouble_are_in_the_code() -> None:
     assert "no message of ours says this" not in code
 
 
-@pytest.mark.parametrize(("script", "page"), [("commands", "cli"), ("options", "options")])
-def test_pages_of_options_are_those_of_the_code(script: str, page: str) -> None:
+@pytest.mark.parametrize(
+    ("script", "page"), [("commands", "cli"), ("options", "options"), ("files", "files")]
+)
+def test_generated_pages_are_those_of_the_code(script: str, page: str) -> None:
     words = [sys.executable, str(ROOT / f"docs/_site/{script}.py")]
     written = subprocess.run(words, capture_output=True, text=True, check=True).stdout
     command = f"python docs/_site/{script}.py > docs/reference/{page}.md"

@@ -60,7 +60,7 @@ def schema(name: str) -> dict[str, Any]:
     if kind is None:
         raise ConfigError(f"no schema {name!r}; there are {', '.join(KINDS)}")
     (root,), components = msgspec.json.schema_components([kind.type], ref_template="#/$defs/{name}")
-    for each in _structs(kind.type):
+    for each in structs(kind.type):
         properties, texts = components[each.__name__]["properties"], field_texts(each)
         for field in properties.keys() & texts.keys():
             properties[field]["description"] = texts[field]
@@ -74,7 +74,7 @@ def schema(name: str) -> dict[str, Any]:
     }
 
 
-def _structs(root: type[msgspec.Struct]) -> list[type[msgspec.Struct]]:
+def structs(root: type[msgspec.Struct]) -> list[type[msgspec.Struct]]:
     """The struct types that a type holds, itself first, in the order of its fields."""
     structs: dict[type[msgspec.Struct], None] = {}
     open_types: list[Any] = [msgspec.inspect.type_info(root)]
@@ -88,54 +88,3 @@ def _structs(root: type[msgspec.Struct]) -> list[type[msgspec.Struct]]:
             inner = msgspec.structs.astuple(each)
         open_types += reversed(inner)
     return list(structs)
-
-
-def page() -> str:
-    """`docs/reference/files.md`: the fields of each kind of file, as Markdown."""
-    parts = [
-        "# Files, field by field\n",
-        (
-            "`evopolicy files schemas/NAME.schema.json` prints the JSON Schema of each of these files (draft 2020-12);"
-            " this page is made from the same source.\n\nAn editor with TOML schemas completes and checks a suite file"
-            " whose first line names its schema: run"
-            " `evopolicy files schemas/suite.toml.schema.json > suite.schema.json`, and begin the file"
-            " with `#:schema ./suite.schema.json`.\n"
-        ),
-    ]
-    for name, kind in KINDS.items():
-        whole = schema(name)
-        parts.append(f"## {name}\n\n{kind.about} Version {kind.version}.\n")
-        for struct in _structs(kind.type):
-            described = whole["$defs"][struct.__name__]
-            if struct is not kind.type:
-                parts.append(f"### {struct.__name__} of {name}\n\n{described.get('description', '')}\n")
-            parts.append("| field | type | default | meaning |\n|---|---|---|---|")
-            needed = described.get("required", ())
-            for field, one in described["properties"].items():
-                default = "" if field in needed else f"`{msgspec.json.encode(one.get('default')).decode()}`"
-                if len(default) > 40:
-                    default = "see there"
-                cells = (f"`{field}`", _type_text(one), default, one.get("description", ""))
-                parts.append("| " + " | ".join(_cell(cell) for cell in cells) + " |")
-            parts.append("")
-    return "\n".join(parts)
-
-
-def _cell(text: str) -> str:
-    return text.replace("|", "&#124;").replace("<", "&lt;").replace(">", "&gt;")
-
-
-def _type_text(described: dict[str, Any]) -> str:
-    """A schema's type in words, such as `string or null`."""
-    if "$ref" in described:
-        return str(described["$ref"].rpartition("/")[2])
-    if "anyOf" in described:
-        return " or ".join(_type_text(each) for each in described["anyOf"])
-    if "enum" in described:
-        return " or ".join(f"`{each}`" for each in described["enum"])
-    if described.get("type") == "array":
-        items: dict[str, Any] = described.get("items") or next(iter(described.get("prefixItems", ())), {})
-        return f"array of {_type_text(items)}" if items else "array"
-    if described.get("type") == "object" and isinstance(described.get("additionalProperties"), dict):
-        return f"object of {_type_text(described['additionalProperties']) or 'any'}"
-    return str(described.get("type", "any"))

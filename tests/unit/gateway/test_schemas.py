@@ -106,11 +106,6 @@ def test_fields_have_the_words_of_their_docstrings() -> None:
     )
 
 
-def test_the_page_is_that_of_the_code() -> None:
-    page = (ROOT / "docs/reference/files.md").read_text()
-    assert page == schemas.page() + "\n", "python docs/_site/files.py > docs/reference/files.md"
-
-
 def test_the_command_prints_a_schema_and_refuses_other_names() -> None:
     evopolicy = str(Path(sys.executable).with_name("evopolicy"))
     done = subprocess.run(
