@@ -105,7 +105,7 @@ PROBES = (
 
 
 def document() -> str:
-    """docs/explanation/hostile-policies.md: the corpus as a table, inside the text of `document.md`."""
+    """docs/explanation/hostile-policies.md: the corpus as a table of verdicts, inside the text of `document.md`."""
     rows = []
     for probe in PROBES:
         first = (POLICIES / f"{probe.name}.py").read_text().split('"""')[1].rstrip(".")
@@ -131,8 +131,11 @@ def document() -> str:
         ),
         ("a packed bundle with compiled code", "the worker refuses it", "by a plain write"),
     ]
-    lines = [f"| {what} | {verdict} | {off} |" for what, verdict, off in rows]
-    table = "\n".join(["| attack | verdict | succeeds |", "|---|---|---|", *lines])
+    groups: dict[tuple[str, str], list[str]] = {}
+    for what, verdict, off in rows:
+        groups.setdefault((verdict, off), []).append(what)
+    lines = [f"| {verdict} | {off} | {'; '.join(attacks)} |" for (verdict, off), attacks in groups.items()]
+    table = "\n".join(["| verdict | succeeds without its defence | attacks |", "|---|---|---|", *lines])
     return Path(__file__).with_name("document.md").read_text().replace("{table}", table)
 
 
