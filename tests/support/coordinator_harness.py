@@ -221,7 +221,7 @@ class GatewayClient:
     async def open(self) -> gateway.RunOpened:
         return await self.ask.until_answered(
             "open",
-            gateway.OpenRun(run=self.run, token=self.token, asks_permit=True, reads_rendered=True),
+            gateway.OpenRun(run=self.run, token=self.token, asks_permit=True),
             gateway.RunOpened,
         )
 

@@ -306,7 +306,7 @@ class Double:
         async def ask(verb: str, message: Message) -> Any:
             return await self._ask(keys.gateway_key(CLUSTER, created.run, verb), message)
 
-        await ask("open", OpenRun(**speaker, asks_permit=True, reads_rendered=True))
+        await ask("open", OpenRun(**speaker, asks_permit=True))
         await ask("permit", RequestPermit(**speaker, boot_id="kernel-of-another-agent"))
         bundle = bundles.pack([BundleFile("policy.py", False, b"class Policy: pass")])
         size = len(bundle.packed)

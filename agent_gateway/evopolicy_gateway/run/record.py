@@ -336,7 +336,7 @@ def _outcome(
             mean_return=mean(reference),
             std_return=std(reference),
             returns=reference,
-            seeded_by="case" if finished.reference_by_case else "run",
+            seeded_by="case",
         )
     # As published: a run without an ok submit has the score 0.0.
     scored: dict[str, Any] = {"final_score": 0.0} if finished.status == "no_ok_submit" else {}

@@ -17,7 +17,7 @@ from typing import Any, TypeVar, cast
 
 import msgspec
 
-from evopolicy_common.errors import ConfigError, RefusedError, TransportError
+from evopolicy_common.errors import RefusedError, TransportError
 from evopolicy_common.logs import structlog
 from evopolicy_common.messages import gateway as messages
 from evopolicy_common.messages.episode import BlobRef
@@ -65,27 +65,16 @@ class CoordinatorClient:
 
     async def open(self) -> messages.RunOpened:
         """Opens the run; returns everything that is fixed for it, and its state."""
-        message = messages.OpenRun(**self._known, asks_permit=True, reads_rendered=True)
+        message = messages.OpenRun(**self._known, asks_permit=True)
         return await self._ask("open", message, messages.RunOpened)
 
     async def permit(self, place: AgentPlace, on_wait: Callable[[str], None]) -> bool:
-        """Returns True once the run's agent may be alive at `place`; calls `on_wait` with the reason while it waits.
-
-        Raises ConfigError when the coordinator's version does not support permits.
-        """
+        """Returns True once the run's agent may be alive at `place`; calls `on_wait` with the reason while it waits."""
         wait_s = FIRST_PERMIT_WAIT_S
         known = self._known | msgspec.structs.asdict(place)
         while True:
             message = messages.RequestPermit(**known, wait_s=wait_s)
-            try:
-                permit = await self._ask("permit", message, messages.Permit, wait_s=wait_s)
-            except RefusedError as error:
-                if error.status != "bad_message":
-                    raise
-                raise ConfigError(
-                    "the coordinator is of an older version, which cannot keep hidden episodes from the agent's"
-                    f" machine: update it, or install its version of evopolicy here ({error.message})"
-                ) from error
+            permit = await self._ask("permit", message, messages.Permit, wait_s=wait_s)
             if permit.granted:
                 return True
             on_wait(permit.waits_for)

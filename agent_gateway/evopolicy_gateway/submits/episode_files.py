@@ -91,7 +91,7 @@ def episode_files(
 
     At the level `scores` these are only the lines of `error.txt`, without messages; `packed` is not read then.
 
-    `packed`: a rendered episode or, from workers of earlier versions, a trajectory. `at`: Unix time for `error.txt`,
+    `packed`: a rendered episode or a trajectory. `at`: Unix time for `error.txt`,
     seconds. `published`: observations are where the published software has them. Raises ProtocolError when `packed` is
     neither, or has another length or return than declared.
     """

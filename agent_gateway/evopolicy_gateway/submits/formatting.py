@@ -23,7 +23,6 @@ MAX_TEXT_BYTES = 64 << 10
 
 _VERDICTS = {
     "rollout_timeout": "the submit's wall-time limit was reached before all episodes were played",
-    "quarantined": "the policy brought its slot down three times; it is not played again",
     "cancelled": "the operator cancelled the run before all episodes were played; nothing is charged",
 }
 """Messages of submits that are not ok without a failure of the policy, by status."""

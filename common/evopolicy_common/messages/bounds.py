@@ -1,6 +1,6 @@
 """Bounds of the parts of a message, enforced by the decoder and by `codec.encode` before sending.
 
-They are wide enough for everything that earlier versions stored. `codec.MAX_MESSAGE_BYTES` bounds a message as a whole.
+`codec.MAX_MESSAGE_BYTES` bounds a message as a whole.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ Number = Annotated[float, Meta(ge=-sys.float_info.max, le=sys.float_info.max)]
 """A finite float."""
 LARGEST = 1e100
 """Greatest magnitude of a return and of every other number of a run, so that sums over many runs and sums of squares
-stay finite. Not a part of `Number`, since earlier versions stored larger ones."""
+stay finite."""
 Many = Annotated[tuple[T, ...], Meta(max_length=1 << 20)]
 Named = Annotated[dict[Word, T], Meta(max_length=1 << 16)]
 Numbered = Annotated[dict[Int, T], Meta(max_length=1 << 20)]

@@ -53,7 +53,7 @@ class EnvironmentDescription(msgspec.Struct, frozen=True, kw_only=True):
     reward_components: Many[Text] = ()
     """Names under which `info`, or its `rewards`, reports parts of the reward; summed per episode in the summary."""
     reward_texts: Named[Text] = {}
-    """Meaning of each reward component; empty from workers of older versions."""
+    """Meaning of each reward component."""
     task_text: Text
     """Markdown for `/task`: objective, observation, action, reward, how an episode ends."""
     deterministic: bool = True
@@ -73,7 +73,7 @@ class EnvironmentDescription(msgspec.Struct, frozen=True, kw_only=True):
     success_at: Literal["end", "any"] = "end"
     """Whether only the last step's value counts, or a true value at any step."""
     adapter: Word = ""
-    """Revision of the adapter, `+`, and a digest of its code; empty from workers of older versions."""
+    """Revision of the adapter, `+`, and a digest of its code."""
     packages: Named[Text] = {}
     """Name to exact version of the distributions that decide this environment's numbers."""
     step_us: Number = 0.0

@@ -177,7 +177,7 @@ class EpisodeOutcome(msgspec.Struct, frozen=True, kw_only=True):
     """Whether the task was solved, as the environment reports it; None where it reports nothing."""
     trajectory: BlobRef | None = None
     """Bytes of the `trajectory` codec: the whole episode, or with record `actions` the action log. For a job with
-    `render`, bytes of `rendered`, except from workers of earlier versions."""
+    `render`, bytes of `rendered`."""
     video: BlobRef | None = None
     """MP4 bytes."""
     stdout: Bytes = b""

@@ -33,11 +33,10 @@ SubmitStatus = Literal[
     "import_error",
     "init_error",
     "rollout_timeout",
-    "quarantined",
     "cancelled",
 ]
 """All verdicts are charged, except `cancelled` (the operator ended the run) and the first two
-(`RejectedStatus`). `quarantined`: only of submits that a coordinator of an earlier version ended."""
+(`RejectedStatus`)."""
 
 CANCELLED = "cancelled"
 """The `close_reason` of a run that its operator cancelled."""
@@ -67,8 +66,6 @@ class OpenRun(FromGateway, frozen=True, kw_only=True, tag="open_run"):
 
     asks_permit: bool = False
     """The gateway sends `RequestPermit` before its agent starts. Otherwise the agent may already be on any machine."""
-    reads_rendered: bool = False
-    """The gateway reads episodes rendered by workers; gateways of earlier versions do not."""
 
 
 class RequestPermit(FromGateway, frozen=True, kw_only=True, tag="request_permit"):

@@ -117,10 +117,7 @@ class RunFinished(msgspec.Struct, frozen=True, kw_only=True):
     hidden_isolation: HiddenIsolation = "unknown"
     fingerprint_overrides: Many[Text] = ()
     """`CLASS → CLASS: why` for each time an operator let the run continue with other versions, oldest first."""
-    reference_by_case: bool = False
-    """The reference's random actions depend on split and case only; False for runs created by an earlier version."""
     committed: Committed | None = None
-    """None for runs opened by an earlier version, which have no commitment."""
     heldout_successes: Many[bool] = ()
     """Whether each held-out episode solved the task; empty where the environment does not report it."""
     installations: Many[Word] = ()
@@ -231,11 +228,11 @@ class EnvironmentState(Message, frozen=True, kw_only=True, tag="environment_stat
     fingerprints: Many[Fingerprint]
     """Distinct fingerprints of the connected workers that offer the environment."""
     classes: Many[Word] = ()
-    """The class of each of `fingerprints`; empty from coordinators of earlier versions."""
+    """The class of each of `fingerprints`."""
     awaited: bool = False
     """No worker has described the environment yet, and one does so now: ask again."""
     result: Bytes = b""
-    """The result of the finished run (`records.journal.Result`, JSON); empty without one, and from earlier versions."""
+    """The result of the finished run (`records.journal.Result`, JSON); empty without one."""
 
 
 class RecordedRequest(FromOperator, frozen=True, kw_only=True, tag="recorded"):

@@ -114,7 +114,6 @@ class RunSettings(msgspec.Struct, frozen=True, kw_only=True):
     simulation: SimulationRule = "forbidden"
     finish: FinishRule = "early"
     step_limit: StepLimit = "natural"
-    """Missing in rows and messages of earlier versions."""
     failed_episodes: FailedEpisodes = "play-on"
     hidden_evaluation: HiddenEvaluation = "submit"
     profile: Profile = "own"

@@ -96,7 +96,7 @@ class Register(Message, frozen=True, kw_only=True, tag="register"):
     undescribed: Many[Word] = ()
     """Ids of shipped environments that it offers, too, and describes once a reply to a heartbeat asks for them."""
     installation: Word = ""
-    """The worker's Python installation (`installs.own`); empty from workers of earlier versions."""
+    """The worker's Python installation (`installs.own`)."""
     missing_tiers: Named[Text] = {}
     """Sandbox tiers that should work there and do not, with the reasons."""
     failed_environments: Named[Text] = {}
@@ -190,9 +190,8 @@ class HeartbeatReply(Message, frozen=True, kw_only=True, tag="beat_reply"):
     """Undescribed environments that runs wait for: the worker registers again with their descriptions."""
 
 
-ResultKind = Literal["done", "returned", "slot_died", "failed"]
-"""done: played. returned: given back unfinished (drained, cancelled). failed: infrastructure.
-slot_died: only from workers of earlier versions; the same as failed."""
+ResultKind = Literal["done", "returned", "failed"]
+"""done: played. returned: given back unfinished (drained, cancelled). failed: infrastructure."""
 
 
 class JobResult(msgspec.Struct, frozen=True, kw_only=True):

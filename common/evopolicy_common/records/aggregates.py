@@ -1,8 +1,8 @@
 """Mean and standard deviation of returns, and the selection by them, as the coordinator, `summary.json` and `run.json`
 have them: whoever checks them needs the same bits.
 
-Returns beyond `bounds.LARGEST`, which earlier versions stored, have finite results too, although their sums are not
-finite.
+Returns beyond `bounds.LARGEST`, which other programs' files may have, have finite results too, although their sums are
+not finite.
 """
 
 from __future__ import annotations

@@ -113,7 +113,7 @@ class SubmitResult(msgspec.Struct, frozen=True, kw_only=True):
     mean_return: Number | None
     val_mean: Number | None
     tree: Word = ""
-    """Digest of the workspace; empty where it was not recorded, and in documents of earlier versions."""
+    """Digest of the workspace; empty where it was not recorded."""
 
 
 class Result(msgspec.Struct, frozen=True, kw_only=True):
@@ -132,9 +132,9 @@ class Result(msgspec.Struct, frozen=True, kw_only=True):
     nondeterministic_results: Int
     submits: Many[SubmitResult]
     heldout_successes: Many[bool] = ()
-    """Empty where the environment reports none, and in documents of earlier versions."""
+    """Empty where the environment reports none."""
     record: Plain = {}
-    """Further fields of `run.json` as they are published, by path. Empty in documents of earlier versions."""
+    """Further fields of `run.json` as they are published, by path."""
 
 
 GATEWAY_SIDE = (
@@ -178,7 +178,7 @@ def _record(finished: RunFinished) -> dict[str, Any]:
     for name, split in (("train", "train"), ("valid", "validation"), ("heldout", "heldout")):
         fields[f"versions.data_{name}_hash"] = hashes.get(f"{name}.json", hashes.get(split, ""))
     if finished.random_heldout_returns:
-        fields["outcome.random_reference.seeded_by"] = "case" if finished.reference_by_case else "run"
+        fields["outcome.random_reference.seeded_by"] = "case"
     for name in ("queue", "rollout", "finalise"):
         fields[f"timing.{name}_s"] = round(float(finished.wall_s.get(name, 0.0)), 3)
     return fields | {

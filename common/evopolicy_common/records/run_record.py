@@ -194,7 +194,7 @@ class Agent(msgspec.Struct, frozen=True, kw_only=True):
     tokens: Tokens | None = None
     """None when nothing counted them."""
     model_use: ModelUse | None = None
-    """None for agents without a model, and in files before version 3."""
+    """None for agents without a model."""
     resources: AgentResources | None = None
     """None for agents that were not started here, and in older files."""
 

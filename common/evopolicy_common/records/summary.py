@@ -61,7 +61,7 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
     successes: tuple[bool | None, ...] | None = None
     """Whether each episode solved the task, as the environment reports it; missing where it reports nothing."""
     policy_failures: int | None = None
-    """Number of episodes in which the policy failed; missing when not ok, and in files of earlier versions."""
+    """Number of episodes in which the policy failed; missing when not ok."""
     warning: str | None = None
     """How the policy failed, in words for the agent; missing when it did not."""
 

@@ -76,10 +76,7 @@ class Definitions:
                 " evopolicy and of the environment's packages on both"
             )
         if shipped is None and not description.adapter:
-            return (
-                "a worker of an earlier version cannot tell its definition: install the same version of evopolicy on"
-                " both"
-            )
+            return "its description names no adapter: install the same version of evopolicy on coordinator and worker"
         return ""
 
     def pin(self, env: str, requested: str, workers: Iterable[Worker]) -> str:

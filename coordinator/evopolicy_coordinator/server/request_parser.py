@@ -40,11 +40,6 @@ _DECODERS: dict[str, Any] = {
 }
 """By the first part of a key after the cluster's name."""
 
-
-_OLD_GATEWAY = (
-    "this gateway is of an earlier version, which cannot read the present reports of workers: install the"
-    " coordinator's version of evopolicy on the agent's host"
-)
 _NO_REASON = "an override of a run's fingerprint class needs a reason"
 
 
@@ -227,9 +222,7 @@ REQUESTS: dict[type[Message], Request] = {
     worker.ReportResults: Request("done", RequestParser._checked_results),
     BlobPut: Request("blob"),
     BlobGet: Request("blob"),
-    gateway.OpenRun: Request(
-        "open", lambda _, m: require(m.reads_rendered, Refusal.WRONG_PROTOCOL, _OLD_GATEWAY)
-    ),
+    gateway.OpenRun: Request("open"),
     gateway.RequestPermit: Request("permit", lambda _, m: checks.check_place(m.boot_id, m.host)),
     gateway.StateRequest: Request("state"),
     gateway.Submit: Request("submit", RequestParser._check_submit, creates=True),

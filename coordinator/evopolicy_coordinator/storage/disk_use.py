@@ -101,7 +101,9 @@ def collect(
         blobs = BlobStore(state / "blobs")
         old_runs = [row.run for row in rows(db, FinishedRow) if row.result.finished_at < now - older_than_s]
         old = (
-            row for row in rows(db, EvaluationRow, "WHERE finished") if row.created_at < now - older_than_s
+            row
+            for row in rows(db, EvaluationRow, "WHERE finished = 1")
+            if row.created_at < now - older_than_s
         )
         old_evaluations = [row.evaluation for row in old]
         groups = [evaluation_group(evaluation) for evaluation in old_evaluations]
@@ -204,7 +206,7 @@ def _size(db: sqlite3.Connection, bounds: Bounds) -> tuple[int, int]:
 def _delete(db: sqlite3.Connection, bounds: Bounds) -> None:
     """Deletes these rows in one short transaction, so that a running coordinator never waits long."""
     db.execute("BEGIN IMMEDIATE")
-    for table in ("outcomes", "strikes", "begun"):
+    for table in ("outcomes", "begun"):
         db.execute(f"DELETE FROM {table} WHERE grp >= ? AND grp < ?", bounds)
     db.execute("COMMIT")
 

@@ -4,8 +4,7 @@ Rules that this module owns:
 - WAL with synchronous=FULL: when `write` returns, its rows survive a power cut; when it raises, none of them are
   stored.
 - One connection writes (`Store`, from one thread at a time); any number read (`Reader`, one connection per thread).
-- A row is its msgpack bytes plus its lookup columns. The schema's version is in `user_version`. An older file is
-  migrated when opened; a newer one is refused.
+- A row is its msgpack bytes plus its lookup columns. A database of another schema is refused.
 - A disk that refuses may accept a write later (StorageError); an unreadable row stays unreadable (DamagedStoreError).
 - The digests that a gateway may fetch (`train_blobs`) are stored in the same transaction as the outcome that names
   them.
@@ -35,52 +34,34 @@ DATABASE = "coordinator.sqlite"
 BUSY_TIMEOUT_S = 10.0
 """How long to wait for another process's transaction: `evopolicy gc` runs beside a coordinator."""
 
-_MIGRATIONS: tuple[str, ...] = (
-    """
-    CREATE TABLE meta (name TEXT PRIMARY KEY, value INTEGER NOT NULL) WITHOUT ROWID;
-    INSERT INTO meta VALUES ('incarnation', 0);
-    CREATE TABLE runs (run TEXT PRIMARY KEY, key TEXT NOT NULL UNIQUE, data BLOB NOT NULL);
-    CREATE TABLE run_states (run TEXT PRIMARY KEY, phase TEXT NOT NULL, data BLOB NOT NULL);
-    CREATE TABLE submits (
-        run TEXT NOT NULL, submit_index INTEGER NOT NULL, key TEXT NOT NULL, data BLOB NOT NULL,
-        PRIMARY KEY (run, submit_index), UNIQUE (run, key)
-    );
-    CREATE TABLE outcomes (
-        grp TEXT NOT NULL, idx INTEGER NOT NULL, seq INTEGER NOT NULL, head BLOB NOT NULL, data BLOB NOT NULL,
-        PRIMARY KEY (grp, idx)
-    );
-    CREATE UNIQUE INDEX outcomes_by_arrival ON outcomes (grp, seq);
-    CREATE TABLE train_blobs (run TEXT NOT NULL, digest TEXT NOT NULL, PRIMARY KEY (run, digest)) WITHOUT ROWID;
-    CREATE TABLE strikes (
-        grp TEXT NOT NULL, lease_id TEXT NOT NULL, data BLOB NOT NULL, PRIMARY KEY (grp, lease_id)
-    );
-    CREATE TABLE evaluations (
-        evaluation TEXT PRIMARY KEY, key TEXT NOT NULL UNIQUE, finished INTEGER NOT NULL, data BLOB NOT NULL
-    );
-    CREATE TABLE finished (run TEXT PRIMARY KEY, data BLOB NOT NULL);
-    CREATE TABLE workers (worker TEXT PRIMARY KEY, data BLOB NOT NULL);
-    """,
-    """
-    CREATE TABLE claims (suite TEXT NOT NULL, name TEXT NOT NULL, data BLOB NOT NULL, PRIMARY KEY (suite, name));
-    """,
-    """
-    CREATE TABLE permits (
-        run TEXT NOT NULL, boot_id TEXT NOT NULL, ended INTEGER NOT NULL, data BLOB NOT NULL,
-        PRIMARY KEY (run, boot_id)
-    );
-    CREATE TABLE kernels (worker TEXT PRIMARY KEY, data BLOB NOT NULL);
-    """,
-    """
-    CREATE TABLE begun (grp TEXT NOT NULL, first INTEGER NOT NULL, data BLOB NOT NULL, PRIMARY KEY (grp, first));
-    """,
-    """
-    CREATE TABLE journal (seq INTEGER PRIMARY KEY, reveals TEXT NOT NULL, data BLOB NOT NULL);
-    CREATE TRIGGER journal_stays BEFORE UPDATE ON journal BEGIN SELECT RAISE(ABORT, 'the journal is never changed'); END;
-    CREATE TRIGGER journal_grows BEFORE DELETE ON journal BEGIN SELECT RAISE(ABORT, 'the journal is never cut'); END;
-    CREATE TABLE documents (run TEXT NOT NULL, kind TEXT NOT NULL, data BLOB NOT NULL, PRIMARY KEY (run, kind));
-    """,  # noqa: E501
+SCHEMA = 6
+"""Version of the tables and of the rows in them."""
+TABLES = {
+    "meta": "name TEXT PRIMARY KEY, value INTEGER NOT NULL",
+    "runs": "run TEXT PRIMARY KEY, key TEXT NOT NULL UNIQUE, data BLOB NOT NULL",
+    "run_states": "run TEXT PRIMARY KEY, phase TEXT NOT NULL, data BLOB NOT NULL",
+    "submits": "run TEXT NOT NULL, submit_index INTEGER NOT NULL, key TEXT NOT NULL, data BLOB NOT NULL,"
+    " PRIMARY KEY (run, submit_index), UNIQUE (run, key)",
+    "outcomes": "grp TEXT NOT NULL, idx INTEGER NOT NULL, seq INTEGER NOT NULL, head BLOB NOT NULL,"
+    " data BLOB NOT NULL, PRIMARY KEY (grp, idx), UNIQUE (grp, seq)",
+    "train_blobs": "run TEXT NOT NULL, digest TEXT NOT NULL, PRIMARY KEY (run, digest)",
+    "begun": "grp TEXT NOT NULL, first INTEGER NOT NULL, data BLOB NOT NULL, PRIMARY KEY (grp, first)",
+    "evaluations": "evaluation TEXT PRIMARY KEY, key TEXT NOT NULL UNIQUE, finished INTEGER NOT NULL,"
+    " data BLOB NOT NULL",
+    "finished": "run TEXT PRIMARY KEY, data BLOB NOT NULL",
+    "workers": "worker TEXT PRIMARY KEY, data BLOB NOT NULL",
+    "claims": "suite TEXT NOT NULL, name TEXT NOT NULL, data BLOB NOT NULL, PRIMARY KEY (suite, name)",
+    "permits": "run TEXT NOT NULL, boot_id TEXT NOT NULL, ended INTEGER NOT NULL, data BLOB NOT NULL,"
+    " PRIMARY KEY (run, boot_id)",
+    "kernels": "worker TEXT PRIMARY KEY, data BLOB NOT NULL",
+    "journal": "seq INTEGER PRIMARY KEY, reveals TEXT NOT NULL, data BLOB NOT NULL",
+    "documents": "run TEXT NOT NULL, kind TEXT NOT NULL, data BLOB NOT NULL, PRIMARY KEY (run, kind)",
+}
+_JOURNAL_GROWS = tuple(
+    f"CREATE TRIGGER journal_{when} BEFORE {when} ON journal"
+    " BEGIN SELECT RAISE(ABORT, 'the journal is only appended to'); END"
+    for when in ("UPDATE", "DELETE")
 )
-SCHEMA_VERSION = len(_MIGRATIONS)
 
 _encode = msgspec.msgpack.Encoder().encode
 
@@ -116,7 +97,8 @@ _PLACES: dict[type[Any], _Place] = {
 _VALUES: dict[str, Callable[[Any], object]] = {
     "grp": lambda row: row.group,
     "idx": lambda row: row.index,
-    "ended": lambda row: row.ended_at is not None,
+    "ended": lambda row: int(row.ended_at is not None),
+    "finished": lambda row: int(row.finished),
     "head": lambda row: _encode(records.head_of(row)),
     "data": _encode,
 }
@@ -130,7 +112,7 @@ class Store:
     """The writing connection. Threads must not use it at the same time."""
 
     def __init__(self, path: Path) -> None:
-        """Opens, creates or migrates the database. Raises ConfigError for a newer version, StorageError."""
+        """Opens or creates the database. Raises ConfigError for another schema, StorageError."""
         self._path = path
         self._db = _connect(path)
         try:
@@ -143,15 +125,19 @@ class Store:
     def _prepare(self) -> None:
         self._db.execute("PRAGMA journal_mode=WAL")
         self._db.execute("PRAGMA synchronous=FULL")
-        version = self._db.execute("PRAGMA user_version").fetchone()[0]
-        if version > SCHEMA_VERSION:
+        with self._transaction():
+            if self._db.execute("SELECT 1 FROM sqlite_master WHERE name = 'meta'").fetchone() is None:
+                for name, columns in TABLES.items():
+                    self._db.execute(f"CREATE TABLE {name} ({columns})")
+                for statement in _JOURNAL_GROWS:
+                    self._db.execute(statement)
+                self._db.execute("INSERT INTO meta VALUES ('incarnation', 0), ('schema', ?)", (SCHEMA,))
+        found = self._db.execute("SELECT value FROM meta WHERE name = 'schema'").fetchone()
+        if found != (SCHEMA,):
             raise ConfigError(
-                f"{self._path} has schema version {version}, and this version of evopolicy reads {SCHEMA_VERSION}:"
-                " update evopolicy"
+                f"{self._path} has schema {found[0] if found else 'unknown'}, and this version of evopolicy reads"
+                f" {SCHEMA} only: use the version that wrote it, or another folder with --state"
             )
-        for number in range(version, SCHEMA_VERSION):
-            script = f"BEGIN IMMEDIATE; {_MIGRATIONS[number]} PRAGMA user_version={number + 1}; COMMIT;"
-            self._db.executescript(script)
 
     def write(self, changed: Iterable[records.Row]) -> None:
         """Writes all rows in one durable transaction. Raises StorageError when it fails; then no row is stored."""
@@ -225,7 +211,7 @@ class Store:
             ),
             evaluations=evaluations,
             workers=tuple(rows(db, records.WorkerRow)),
-            permits=tuple(rows(db, records.PermitRow, "WHERE NOT ended")),
+            permits=tuple(rows(db, records.PermitRow, "WHERE ended = 0")),
             kernels=tuple(rows(db, records.KernelRow)),
             journal=next(rows(db, records.JournalRow, "ORDER BY seq DESC LIMIT 1"), None),
             revealed=tuple(revealed(db)),
@@ -390,7 +376,7 @@ def _write_row(db: sqlite3.Connection, row: records.Row) -> None:
     db.execute(statement, [value(row) for value in values])
     if isinstance(row, records.OutcomeRow) and (run := train_run(row.group)) is not None:
         for ref in stored_blobs(row.outcome):
-            db.execute("INSERT OR IGNORE INTO train_blobs VALUES (?, ?)", (run, ref.digest))
+            db.execute("INSERT INTO train_blobs VALUES (?, ?) ON CONFLICT DO NOTHING", (run, ref.digest))
 
 
 def train_run(group: str) -> str | None:

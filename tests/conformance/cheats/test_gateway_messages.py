@@ -140,7 +140,7 @@ ALLOWED: dict[str, dict[str, str]] = {
     "SubmitDone": {
         "status": (
             "'budget_invalid' | 'cancelled' | 'denied_import' | 'import_error' | 'init_error' | 'invalid_env_instance'"
-            " | 'missing_policy' | 'ok' | 'quarantined' | 'rollout_timeout'"
+            " | 'missing_policy' | 'ok' | 'rollout_timeout'"
         ),
         "n_episodes": "int",
         "env_instances": "[int]",

@@ -66,7 +66,7 @@ async def refusals(client: GatewayClient) -> dict[str, Refusal]:
     own = {"run": client.run, "token": client.token}
     late = bundle_of("# late")
     asked = {
-        "open": client.ask.once("open", gateway.OpenRun(**own, reads_rendered=True), gateway.RunOpened),
+        "open": client.ask.once("open", gateway.OpenRun(**own), gateway.RunOpened),
         "state": client.ask.once("state", gateway.StateRequest(**own), gateway.StateReply),
         "upload": client.ask.upload(client.run, client.token, late.digest, late.packed),
         "submit": client.submit_digest(bundle_of("# first").digest, (0,), "late"),

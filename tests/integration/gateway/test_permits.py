@@ -8,15 +8,13 @@ from pathlib import Path
 from typing import TypeVar
 
 import pytest
-from gateway_double import Double, answering, gateway_on, opened, prepare, prepared, served
+from gateway_double import Double, gateway_on, opened, prepared, served
 
-from evopolicy_common.errors import ConfigError
 from evopolicy_common.messages.gateway import CloseRun, OpenRun, RequestPermit
 from evopolicy_common.messages.run_settings import ELSEWHERE, RunSettings
-from evopolicy_common.messages.worker import Message, Refused
+from evopolicy_common.messages.worker import Message
 from evopolicy_common.processes import host
 from evopolicy_common.records.open_run import IntendedRun
-from evopolicy_common.refusals import Refusal
 from evopolicy_gateway.processes import child_messages
 from evopolicy_gateway.run.gateway import Gateway
 from evopolicy_gateway.run_folder import listener
@@ -114,17 +112,6 @@ async def test_an_ended_agents_gateway_closes_the_run_without_a_permit(tmp_path:
         gateway.tell(child_messages.CloseRun(reason="agent_stopped"))
         assert await gateway.run()
     assert double.closed is not None
-
-
-async def test_coordinator_of_an_older_version_is_an_error_with_the_remedy(tmp_path: Path) -> None:
-    double = Double(opened())
-    older = Refused(status=Refusal.BAD_MESSAGE, message="not a message")
-    double.intercept = lambda message: older if isinstance(message, RequestPermit) else None
-    async with answering(tmp_path, double) as found:
-        gateway, events = quiet(prepare(tmp_path / "run", found, double))
-        with pytest.raises(ConfigError, match=r"older version.*update it"):
-            await gateway.run()
-    assert events == [""]
 
 
 @pytest.mark.parametrize(("agent_host", "asks_for"), [("", ""), (KERNEL, KERNEL), (ELSEWHERE, "")])

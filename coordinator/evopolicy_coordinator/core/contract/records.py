@@ -57,16 +57,13 @@ class RunRow(msgspec.Struct, frozen=True, kw_only=True, tag="run"):
     denied_imports: tuple[str, ...] = ()
     max_steps: int = 0
     """Steps after which an episode is truncated; 0: only its environment ends it."""
-    reference_by_case: bool = False
-    """The random reference's actions follow from split and case; if False (rows of earlier versions), from `secret`."""
     epoch: str = ""
-    """Of the cases; empty in rows of earlier versions."""
+    """Of the cases."""
     trials: str = ""
     """As in `journal.Opening`."""
     salt: bytes = b""
     """32 random bytes; of the commitment."""
     committed: Committed | None = None
-    """None in rows of earlier versions."""
     created_at: float = 0.0
     """Unix time, seconds (so are all `*_at`)."""
     stimulus_id: str = ""
@@ -95,7 +92,7 @@ class RunStateRow(msgspec.Struct, frozen=True, kw_only=True, tag="run_state"):
     infrastructure_retries: int = 0
     nondeterministic_results: int = 0
     isolation: HiddenIsolation = "unknown"
-    """Isolation that has held so far; `unknown` in rows of older versions."""
+    """Isolation that has held so far."""
     remaining_budget: int = 0
     """Once finished: train episodes that were not spent."""
     n_submits: int = 0
@@ -227,7 +224,7 @@ class KernelRow(msgspec.Struct, frozen=True, kw_only=True, tag="kernel"):
     worker: str
     boot_id: str
     machine: str = ""
-    """As `Worker.machine`; missing in rows of earlier versions."""
+    """As `Worker.machine`."""
 
 
 class JournalRow(msgspec.Struct, frozen=True, kw_only=True, tag="journal"):
@@ -278,9 +275,9 @@ class OutcomeHead(msgspec.Struct, frozen=True, kw_only=True):
     trajectory: str | None = None
     """Digest of the trajectory; None when there is none."""
     worker: str = ""
-    """The player; empty in rows of older versions."""
+    """The player."""
     success: bool | None = None
-    """As `EpisodeOutcome.success`; None in rows of older versions."""
+    """As `EpisodeOutcome.success`."""
 
 
 def head_of(row: OutcomeRow) -> OutcomeHead:

@@ -10,7 +10,7 @@ Rules that this module owns:
   run whose selected policy fails in a held-out episode ends as an error.
 - A checkpoint that an earlier version found ineligible stays so; only the finished run's result reports it.
 - The selected checkpoint plays all held-out cases; uniform random actions play the same ones. Those actions follow from
-  split and case (`jobs.reference_seed`), except in runs of earlier versions, where they follow from the run's secret.
+  split and case (`jobs.reference_seed`).
 - The stage follows from stored rows: `advance` may be called any number of times.
 """
 

@@ -42,7 +42,6 @@ def create(state: State, event: events.RunCreated, step: Step) -> None:
         raise NotDoneError("run_exists", run=row.run)
     row = msgspec.structs.replace(
         row,
-        reference_by_case=True,
         created_at=step.now,
         stimulus_id=step.stimulus_id,
     )

@@ -82,7 +82,6 @@ def hidden(split: Literal["validation", "heldout"], run: Run, row: SubmitRow, st
 
 def random(run: Run, step: Step) -> JobGroup:
     """Uniform random actions on all held-out cases."""
-    by_case = run.row.reference_by_case
     return _group(
         "random",
         run,
@@ -93,8 +92,8 @@ def random(run: Run, step: Step) -> JobGroup:
         priority=REFERENCE,
         stimulus_id=run.row.stimulus_id,
         env_meta={"env": run.row.settings.env},
-        split="heldout" if by_case else "random",
-        secret=None if by_case else run.row.secret,
+        split="heldout",
+        secret=None,
     )
 
 

@@ -14,7 +14,7 @@ Rules that this module owns:
   gateway is the worker's failure.
 - The time that an episode took counts for the fair share only up to the time for which its worker had the lease.
 - A failure that a policy can cause in its slot is an outcome. A failure that it cannot cause is retried without limit:
-  `failed`, or `slot_died` from workers of earlier versions. An environment that keeps ending a job is given up
+  `failed`. An environment that keeps ending a job is given up
   (`retry`).
 """
 

@@ -19,7 +19,6 @@ from evopolicy_common.messages.operator import EvaluationStarted, RunProgress
 from evopolicy_common.messages.run_settings import PUBLISHED
 from evopolicy_coordinator.core.contract.effects import ReadEvaluation
 from evopolicy_coordinator.core.contract.records import EvaluationRow, RunRow, SubmitRow
-from evopolicy_coordinator.core.leasing.jobs import policy_seed
 from evopolicy_coordinator.server.reason_texts import words
 
 
@@ -100,24 +99,6 @@ def test_runs_on_one_split_play_the_same_random_reference(rig: Rig) -> None:
     first = random_seeds(rig, session, "r1")
     assert first == random_seeds(rig, session, "r2")
     assert len(set(first)) == 3
-    assert rig.finished("r2").reference_by_case
-
-
-def test_a_run_of_an_earlier_version_keeps_its_random_reference(rig: Rig) -> None:
-    rig.create()
-    row = rig.row(RunRow, "r1")
-    rig.rows[RunRow, "r1"] = msgspec.structs.replace(row, reference_by_case=False)
-    rig.load()
-    session = rig.register()
-    found: list[bytes] = []
-
-    def value(job: Job) -> float:
-        found.extend(spec.policy_seed for spec in job.episodes if split_of(job) == "random")
-        return 1.0
-
-    rig.finish(session, value)
-    assert sorted(found) == sorted(policy_seed(row.secret, -1, "random", case, 0) for case in range(3))
-    assert not rig.finished().reference_by_case
 
 
 def test_random_actions_outside_a_run_are_the_reference_of_their_split(rig: Rig) -> None:

@@ -120,21 +120,6 @@ def test_a_snapshot_that_could_not_be_made_is_a_verdict_and_charged() -> None:
     assert isinstance(rig.submit(0, key="k1"), gateway.SubmitAccepted)
 
 
-def test_an_earlier_versions_dead_slot_is_played_again() -> None:
-    rig, session = started(0)
-    for attempt in range(4):
-        rig.pass_time(60.0)
-        session = rig.register(slots=8)
-        (lease,) = rig.poll(session, 1, wait_s=1.0)
-        assert lease.attempt == attempt + 1
-        rig.report_results(session, result(lease, "slot_died", error="oops"))
-        assert rig.row(SubmitRow, "r1", 0).status is None
-    rig.pass_time(60.0)
-    session = rig.register(slots=8)
-    rig.play(session, *rig.poll(session, 1, wait_s=1.0))
-    assert rig.row(SubmitRow, "r1", 0).status == "ok"
-
-
 def test_a_submit_limit_keeps_episodes_before_the_first_unfinished() -> None:
     rig, session = started(limits=ResourceLimits(submit_wall_s=30.0))
     rig.pass_time(20.0)

@@ -21,11 +21,11 @@ SOON_S = 0.2
 async def test_a_query_that_nobody_waits_for_any_more_is_let_go(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(service, "_FORGET_S", SOON_S)
     monkeypatch.setattr(service, "_SWEEP_S", SOON_S / 4)
 
     async with started(tmp_path) as world:
         created = await world.create()
+        monkeypatch.setattr(service, "_FORGET_S", SOON_S)
         wait = operator.WaitRun(token="operate", run=created.run, wait_s=60)
         assert await world.answer(Requested(keys.operator_key("c", "wait"), wait)) is None
 

@@ -69,7 +69,7 @@ def test_no_coordinator_takes_a_description_that_fills_its_messages(changed: dic
 
 def test_a_worker_that_cannot_tell_its_definition_offers_what_ships_alone() -> None:
     _, refused = strict().admit([describe("acme/glider")])
-    assert "a worker of an earlier version" in refused["acme/glider"]
+    assert "names no adapter" in refused["acme/glider"]
 
 
 def workers(*described: Any) -> Any:

@@ -215,15 +215,6 @@ def test_submit_needs_its_bundle_stored_or_the_reason_why_there_is_none(
     assert refused(parser, SUBMIT, submit(bundle=stored, bundle_error=failure)).status == "bad_message"
 
 
-def test_a_gateway_that_cannot_read_rendered_episodes_is_told_to_be_updated(parser: RequestParser) -> None:
-    key = keys.gateway_key("c", "r", "open")
-    opened = gateway.OpenRun(run="r", token="capable", asks_permit=True, reads_rendered=True)
-    assert event(parser, key, opened).message == opened
-    error = refused(parser, key, msgspec.structs.replace(opened, reads_rendered=False))
-    assert error.status == "wrong_protocol"
-    assert "install the coordinator's version" in error.message
-
-
 def test_override_of_a_runs_class_needs_a_reason(parser: RequestParser) -> None:
     values = {"token": "operate", "run": "r", "fingerprint_class": "c"}
     assert event(parser, OPS, operator.RepinRun(**values, reason="gone")).message.reason == "gone"

@@ -7,7 +7,6 @@ import sqlite3
 from collections.abc import Iterator
 from pathlib import Path
 
-import msgspec
 import pytest
 from rigs.store_rows import blob, outcome_row, run_row, state_row, submit_row
 
@@ -19,13 +18,11 @@ from evopolicy_coordinator.core.contract.records import (
     EvaluationRow,
     JournalRow,
     KernelRow,
-    PermitRow,
     WorkerRow,
     head_of,
 )
 from evopolicy_coordinator.storage import disk_use
-from evopolicy_coordinator.storage import store as store_module
-from evopolicy_coordinator.storage.store import SCHEMA_VERSION, Reader, Store, train_run
+from evopolicy_coordinator.storage.store import SCHEMA, Reader, Store, train_run
 
 TRAIN = records.submit_group("r-1", 0, "train")
 
@@ -84,17 +81,6 @@ def test_everything_written_is_loaded_again_after_reopening(path: Path) -> None:
     assert snapshot.workers == (rows[5],)
 
 
-def test_strikes_that_an_earlier_version_wrote_are_read_past(path: Path) -> None:
-    store = Store(path)
-    store.write([run_row(), state_row(), submit_row()])
-    store.close()
-    with contextlib.closing(sqlite3.connect(path)) as db, db:
-        db.execute("INSERT INTO strikes VALUES (?, 'l', x'81')", (TRAIN,))
-    store = Store(path)
-    assert store.load().submits == (submit_row(),)
-    store.close()
-
-
 def test_the_journal_can_only_grow(path: Path) -> None:
     """Attack: change or cut the journal. Defence: the heads that `run.json` and reports print no longer
     match."""
@@ -119,22 +105,6 @@ def test_the_journal_can_only_grow(path: Path) -> None:
         assert (opening.data, result) == (b"{}", None)
 
 
-def test_a_store_from_before_the_journal_opens_with_an_empty_one(
-    path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    with monkeypatch.context() as earlier:
-        earlier.setattr(store_module, "_MIGRATIONS", store_module._MIGRATIONS[:5])
-        earlier.setattr(store_module, "SCHEMA_VERSION", 5)
-        old = Store(path)
-        old.write([run_row(), state_row()])
-        old.close()
-    store = Store(path)
-    snapshot = store.load()
-    store.close()
-    assert (snapshot.journal, snapshot.revealed) == (None, ())
-    assert [row.committed for row in snapshot.runs] == [None]
-
-
 def test_incarnation_counts_every_load(path: Path) -> None:
     for expected in (1, 2, 3):
         store = Store(path)
@@ -156,24 +126,6 @@ def test_workers_that_have_ended_are_forgotten_on_their_own_kernel_alone(store: 
     )
     store.forget_kernels("k1")
     assert [row.worker for row in store.load().kernels] == ["there"]
-
-
-def test_permits_and_kernels_that_an_earlier_version_wrote_are_read(store: Store, path: Path) -> None:
-    permit = {
-        "type": "permit",
-        "run": "r",
-        "boot_id": "k",
-        "machine_id": "m",
-        "host": "lab",
-        "granted_at": 5.0,
-    }
-    kernel = {"type": "kernel", "worker": "w", "boot_id": "k", "machine_id": "m"}
-    with contextlib.closing(sqlite3.connect(path)) as db, db:
-        db.execute("INSERT INTO permits VALUES ('r', 'k', 0, ?)", (msgspec.msgpack.encode(permit),))
-        db.execute("INSERT INTO kernels VALUES ('w', ?)", (msgspec.msgpack.encode(kernel),))
-    snapshot = store.load()
-    assert snapshot.permits == (PermitRow(run="r", boot_id="k", host="lab", granted_at=5.0),)
-    assert snapshot.kernels == (KernelRow(worker="w", boot_id="k"),)
 
 
 def test_write_that_fails_leaves_nothing_behind(store: Store) -> None:
@@ -258,47 +210,23 @@ def test_only_train_groups_belong_to_a_gateway() -> None:
         assert train_run(group) is None
 
 
-@pytest.mark.parametrize("version", range(1, SCHEMA_VERSION))
-def test_an_older_database_is_migrated_with_all_its_rows(path: Path, version: int) -> None:
-    db = sqlite3.connect(path, isolation_level=None)
-    for script in store_module._MIGRATIONS[:version]:
-        db.executescript(script)
-    db.execute(f"PRAGMA user_version={version}")
-    older = msgspec.msgpack.decode(msgspec.msgpack.encode(run_row()))
-    del older["related"]  # a field that came later
-    db.execute("INSERT INTO runs VALUES ('r-1', 'key-r-1', ?)", (msgspec.msgpack.encode(older),))
-    db.execute("INSERT INTO run_states VALUES ('r-1', 'open', ?)", (msgspec.msgpack.encode(state_row()),))
-    db.close()
-    for _ in range(2):
-        store = Store(path)
-        snapshot = store.load()
-        assert store._db.execute("PRAGMA user_version").fetchone()[0] == SCHEMA_VERSION
-        store.close()
-        assert snapshot.runs == (run_row(),)
-        assert snapshot.states == (state_row(),)
-
-
-def test_a_migration_that_fails_halfway_leaves_the_older_version(
-    path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    with monkeypatch.context() as patched:
-        broken = "CREATE TABLE made (name TEXT); CREATE TABLE made (name TEXT);"
-        patched.setattr(store_module, "_MIGRATIONS", (*store_module._MIGRATIONS, broken))
-        patched.setattr(store_module, "SCHEMA_VERSION", SCHEMA_VERSION + 1)
-        with pytest.raises(StorageError, match="made"):
-            Store(path)
-    store = Store(path)
-    assert store._db.execute("PRAGMA user_version").fetchone()[0] == SCHEMA_VERSION
-    assert store._db.execute("SELECT * FROM sqlite_master WHERE name = 'made'").fetchone() is None
-    store.close()
-
-
-def test_file_of_a_newer_version_is_refused(path: Path) -> None:
+def test_a_database_of_another_schema_is_refused_and_unchanged(path: Path) -> None:
     Store(path).close()
-    db = sqlite3.connect(path)
-    db.execute(f"PRAGMA user_version={SCHEMA_VERSION + 1}")
-    db.close()
-    with pytest.raises(ConfigError, match="newer"):
+    with contextlib.closing(sqlite3.connect(path)) as db, db:
+        db.execute("UPDATE meta SET value = value + 1 WHERE name = 'schema'")
+    before = path.read_bytes()
+    with pytest.raises(
+        ConfigError, match=f"has schema {SCHEMA + 1}, .* reads {SCHEMA} only: use the version"
+    ):
+        Store(path)
+    assert path.read_bytes() == before
+
+
+def test_a_database_without_a_schema_number_is_refused(path: Path) -> None:
+    Store(path).close()
+    with contextlib.closing(sqlite3.connect(path)) as db, db:
+        db.execute("DELETE FROM meta WHERE name = 'schema'")
+    with pytest.raises(ConfigError, match="has schema unknown"):
         Store(path)
 
 

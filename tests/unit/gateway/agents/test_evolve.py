@@ -99,7 +99,7 @@ def test_a_run_with_a_single_train_case_uses_only_that(tmp_path: Path) -> None:
 
 
 def test_submits_that_are_not_ok_are_survived(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    with serving(a_run(tmp_path, 40, statuses=["rollout_timeout", "quarantined"])) as gateway:
+    with serving(a_run(tmp_path, 40, statuses=["rollout_timeout", "cancelled"])) as gateway:
         agent_of(gateway).run()
         assert gateway.left == 0
         assert gateway.submits[-1]["status"] == "ok"

@@ -101,7 +101,7 @@ def test_bounds_of_a_picture_are_those_of_its_bytes() -> None:
 
 
 def test_bounds_of_a_schema_of_an_older_version_are_read() -> None:
-    low, high = bounds({"type": "Box", "shape": [40], "dtype": "float64", "min": "-inf", "max": 1.0})
+    low, high = bounds({"type": "Box", "shape": [40], "dtype": "float64", "low": "-inf", "high": 1.0})
     assert (low.shape, low.max(), high.min()) == ((40,), -np.inf, 1.0)
 
 
