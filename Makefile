@@ -14,6 +14,7 @@
 # make bench-start        what one waits for before anything is played
 # make bench-replay       how far Codex and Claude Code are replayed, where they are installed
 # make bench-peers        the same episodes through Gymnasium's vectors, Ray and Dask, where they are installed
+# make bench-against      small submits of another revision and of the files here, in turns; ARGS="--revision REV"
 # make bench-throughput   episodes per second through the coordinator
 # make bench-scale        CPU of coordinator, gateways and workers' supervisors an episode, with real trajectories
 # make bench-channels     what a policy can tell others on its machine, at once and afterwards; --gaps N: what time tells it of its split
@@ -34,7 +35,7 @@ FAMILIES := $(VENV)/.families
 STAMP := $(VENV)/.installed
 
 .DEFAULT_GOAL := help
-.PHONY: help install families paper-worker demo test test-root test-system test-families test-long check check-envs docs release bench bench-start bench-replay bench-peers bench-throughput bench-scale bench-channels bench-coverage bench-isolation bench-costs faults sim clean
+.PHONY: help install families paper-worker demo test test-root test-system test-families test-long check check-envs docs release bench bench-start bench-replay bench-peers bench-against bench-throughput bench-scale bench-channels bench-coverage bench-isolation bench-costs faults sim clean
 
 help:
 	@sed -n 's/^# make/make/p' Makefile
@@ -134,6 +135,10 @@ bench-replay: install
 # Peers of another Python: make bench-peers ARGS="--python /path/to/python"
 bench-peers: install
 	@PYTHONPATH=tests/bench:tests/support $(BIN)/python tests/bench/peers_bench.py $(ARGS)
+
+# Not slower than the revision in tests/bench/revision.txt? Another: make bench-against ARGS="--revision REV --rounds 5"
+bench-against: install
+	@PYTHONPATH=tests/bench $(BIN)/python tests/bench/against_bench.py $(ARGS)
 
 # Episodes per second through coordinator and Zenoh.
 bench-throughput: install

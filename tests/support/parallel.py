@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import atexit
 import contextlib
+import io
 import os
 import sys
 import traceback
@@ -20,6 +21,7 @@ from multiprocessing.connection import Connection, wait
 from typing import Any, NamedTuple
 
 import pytest
+from _pytest._io import TerminalWriter
 
 
 class _Process(NamedTuple):
@@ -160,6 +162,13 @@ class _Sends:
             self.connection.send(("warning", content))
 
 
+class _Nowhere:
+    """Takes the terminal reporter's place in a forked process, which reports by its connection."""
+
+    def __init__(self) -> None:
+        self._tw = TerminalWriter(io.StringIO())
+
+
 def _serve(session: pytest.Session, name: str, connection: Connection) -> None:
     """Plays the tests that it is given, to the end of the connection."""
     config = session.config
@@ -170,6 +179,8 @@ def _serve(session: pytest.Session, name: str, connection: Connection) -> None:
     for plugin in ("terminalreporter", "terminalprogress"):
         if config.pluginmanager.hasplugin(plugin):
             config.pluginmanager.unregister(name=plugin)
+    # pytest-timeout writes its stacks by this plugin.
+    config.pluginmanager.register(_Nowhere(), "terminalreporter")
     sends = _Sends(config)
     config.pluginmanager.register(sends)
     sends.connection = connection

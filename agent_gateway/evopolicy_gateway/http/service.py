@@ -13,8 +13,6 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import hmac
-import html
-from http.server import BaseHTTPRequestHandler
 from typing import Any
 
 import msgspec
@@ -112,36 +110,7 @@ def make_app(pipeline: SubmitPipeline, token: str, bearer: str = "") -> ASGIApp:
         },
     )
     app.router.redirect_slashes = False
-    if machine.run.profile == "own":
-        return _TokenGate(app, token, bearer)
-    app.add_exception_handler(HTTPException, _published_http_error)
-    return _TokenGate(_published_methods(app), token, bearer)
-
-
-async def _published_http_error(request: Request, error: Exception) -> Response:
-    if (request.method, request.url.path) == ("POST", "/finalize"):
-        code, status, message = 405, "method_not_allowed", "a run is finalized by itself"
-    else:
-        code, status, message = 404, "not_found", "unknown endpoint"
-    return _json(code, {"status": status, "error": {"message": message}})
-
-
-def _published_methods(app: ASGIApp) -> ASGIApp:
-    """Answers other methods than the published service's as Python's `http.server` does, whatever the URL."""
-
-    async def answer(scope: Scope, receive: Receive, send: Send) -> None:
-        method = scope["method"]
-        if method in ("GET", "POST"):
-            await app(scope, receive, send)
-            return
-        message = html.escape(f"Unsupported method ({method!r})", quote=False)
-        explain = "Server does not support this operation"
-        page = BaseHTTPRequestHandler.error_message_format
-        page %= {"code": 501, "message": message, "explain": explain}
-        headers = {"Content-Type": BaseHTTPRequestHandler.error_content_type, "Connection": "close"}
-        await Response("" if method == "HEAD" else page, 501, headers=headers)(scope, receive, send)
-
-    return answer
+    return _TokenGate(app, token, bearer)
 
 
 def _of_ticket(ticket: Ticket, pipeline: SubmitPipeline) -> Response:
@@ -151,17 +120,16 @@ def _of_ticket(ticket: Ticket, pipeline: SubmitPipeline) -> Response:
     summary = pipeline.summary(ticket)
     if summary is None:
         return _json(202, progress_document(ticket))
-    head: dict[str, Any] = {"submit_id": ticket.index, "status": ticket.status}
-    if ticket.request.rejected is None:
-        head |= {
-            "is_finalized": pipeline.machine.finalizes(ticket),
-            "feedback": f"feedback/{ticket.submit_id}",
-            "policy_failures": ticket.policy_failures,
-            "warning": ticket.warning,
-        }
+    head = {
+        "submit_id": ticket.index,
+        "status": ticket.status,
+        "is_finalized": pipeline.machine.finalizes(ticket),
+        "feedback": f"feedback/{ticket.submit_id}",
+        "policy_failures": ticket.policy_failures,
+        "warning": ticket.warning,
+    }
     body = orjson.dumps(head)[:-1] + b',"summary":' + summary + b"}"
-    code = 200 if ticket.request.rejected is None else 400
-    return Response(body, code, media_type="application/json")
+    return Response(body, media_type="application/json")
 
 
 async def _read_body(request: Request) -> bytes:
@@ -203,9 +171,12 @@ async def _request_error(request: Request, error: Exception) -> Response:
 
 async def _http_error(request: Request, error: Exception) -> Response:
     assert isinstance(error, HTTPException)
-    words = {404: "there is nothing here", 405: "this method is not for this URL"}
-    message = words.get(error.status_code, "the request cannot be served")
-    response = _json(error.status_code, {"error": {"message": message}})
+    answers = {
+        404: ("not_found", "unknown endpoint"),
+        405: ("method_not_allowed", "this URL does not take this method"),
+    }
+    status, message = answers.get(error.status_code, ("bad_request", "the request cannot be served"))
+    response = _json(error.status_code, {"status": status, "error": {"message": message}})
     response.headers.update(error.headers or {})
     return response
 

@@ -114,7 +114,6 @@ class CoordinatorClient:
         message = messages.Submit(
             **self._known,
             **{name: getattr(request, name) for name in _AS_REQUESTED},
-            rejected=None if request.rejected is None else request.rejected.status,
             after=after,
         )
         return await self._ask("submit", message, messages.SubmitAccepted)

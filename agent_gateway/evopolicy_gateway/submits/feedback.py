@@ -260,13 +260,10 @@ class Collector:
         log.error(event, submit=self.accepted.key, index=episode.index, **facts)
 
     def _commit(self, done: SubmitDone) -> bytes:
-        errors, request, run = None, self.ticket.request, self.machine.run
+        errors, run = None, self.machine.run
         own = run.profile == "own"
         if done.status != "ok":
-            text = "" if request.rejected is None else request.rejected.message
-            errors = formatting.verdict_line(
-                done.status, done.failure, done.completed_at, message=text, traceback=own
-            )
+            errors = formatting.verdict_line(done.status, done.failure, done.completed_at, traceback=own)
             for late in [index for index in self.scores if index >= done.n_kept]:
                 self.tree.drop_episode(self._name(late))
         summary = formatting.summary_bytes(
@@ -276,7 +273,6 @@ class Collector:
             list(self.scores.values()),
             run.observations,
             messages=shows_texts(run.feedback, run.env.obs_storage),
-            echoed=request.echoed,
             every_key=not own,
         )
         self.tree.commit(summary, errors)

@@ -51,18 +51,14 @@ def failure_line(failure: PolicyFailure, at: float) -> bytes:
     return _line(at, failure.category, failure.message, failure.traceback, **more)
 
 
-def verdict_line(
-    status: str, failure: PolicyFailure | None, at: float, *, message: str = "", traceback: bool = True
-) -> bytes:
+def verdict_line(status: str, failure: PolicyFailure | None, at: float, *, traceback: bool = True) -> bytes:
     """The line of `errors.txt` with the reason why a submit is not ok; its category is the submit's status.
 
-    The failure's own category precedes the message when the two differ. `message`: of a rejected request. `traceback`:
-    False writes null for it, as published.
+    The failure's own category precedes the message when the two differ. `traceback`: False writes null for it, as
+    published.
     """
-    own, details = message, ""
-    if failure is None:
-        own = own or _VERDICTS.get(status, f"the submit ended with {status}")
-    else:
+    own, details = _VERDICTS.get(status, f"the submit ended with {status}"), ""
+    if failure is not None:
         same = failure.category == status or failure.category in NO_POLICY
         own = failure.message if same else f"{failure.category}: {failure.message}"
         details = failure.traceback
@@ -77,13 +73,12 @@ def summary_bytes(
     observations: ObservationForm = "arrays",
     *,
     messages: bool = True,
-    echoed: Sequence[int] | None = None,
     every_key: bool = False,
 ) -> bytes:
     """The bytes of `summary.json`. `scores` hold every episode of a played submit, in any order.
 
-    `messages`: whether the warning quotes the policy's own messages. `echoed`: train ids to be shown in place of those
-    that were played. `every_key`: the parts of the reward are null and not left out, as published.
+    `messages`: whether the warning quotes the policy's own messages. `every_key`: the parts of the reward are null and
+    not left out, as published.
 
     Raises ValueError when an ok submit lacks an episode.
     """
@@ -129,8 +124,6 @@ def summary_bytes(
         warning=_warning(ordered, observations, ends=not ok, messages=messages) if played else None,
     )
     fields = plain(msgspec.to_builtins(summary))
-    if echoed is not None:
-        fields["env_instances"] = list(echoed)
     if every_key:
         fields |= dict.fromkeys(("reward_components_mean", "reward_components_per_episode"))
     return msgspec.json.format(msgspec.json.encode(fields), indent=2) + b"\n"

@@ -87,8 +87,6 @@ class SubmitPipeline:
             await self.note_rejected(error)
             raise
         self._go_on()
-        if (rejected := ticket.request.rejected) is not None:
-            await self.note_rejected(RequestError(rejected.status, rejected.message))
         return ticket
 
     async def note_rejected(self, error: RequestError) -> None:

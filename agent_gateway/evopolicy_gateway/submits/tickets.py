@@ -15,8 +15,7 @@ The pipeline performs one effect at a time and passes its outcome to the method 
 | met an error         | entry `Died` | `noted`: the error, which ends the process. If that happens to |
 |                      |              | the next gateway too: the entry `SetAside`, its end            |
 
-State that survives the process changes in `noted` alone, when its entry is durable. A request that plays
-nothing skips the snapshot, and without a folder also the collecting.
+State that survives the process changes in `noted` alone, when its entry is durable.
 """
 
 from __future__ import annotations
@@ -36,7 +35,6 @@ from evopolicy_common.records.blobs import digest_of
 from evopolicy_common.records.open_run import AnyEntry, Requested
 from evopolicy_common.refusals import RUN_OVER, Refusal
 from evopolicy_gateway.run_folder.layout import submit_id
-from evopolicy_gateway.submits import published_requests
 from evopolicy_gateway.submits.snapshots import Snapshot
 from evopolicy_gateway.submits.submit_request import Bounds, parse
 
@@ -160,8 +158,7 @@ class TicketMachine:
 
     def finalizes(self, ticket: Ticket) -> bool:
         """Whether the run is spent, and `ticket` is the last that played."""
-        played = (each for each in reversed(self.tickets) if each.request.rejected is None)
-        return self.spent and ticket is next(played)
+        return self.spent and ticket is self.tickets[-1]
 
     def find(self, name: str) -> Ticket | None:
         """Returns the submit with that index or folder name; None when there is none."""
@@ -183,37 +180,25 @@ class TicketMachine:
         if self.in_flight is not None:
             index, name = self.in_flight.index, self.in_flight.submit_id
             raise ConflictError(index, f"{name} is running; wait for it, or ask GET /submit/{index}")
-        rejected = None
-        try:
-            ids = self._ids(body)
-        except published_requests.OddRequestError as error:
-            ids, rejected = error.ids, error.rejection
-        return self._begin(
-            Requested(
-                key=key,
-                client_key=client_key,
-                body_digest=digest_of(body),
-                env_instances=() if rejected else tuple(map(int, ids)),
-                bundle=None,
-                bundle_error=None,
-                echoed=ids if rejected or any(type(each) is bool for each in ids) else None,
-                rejected=rejected,
-            )
-        )
-
-    def _ids(self, body: bytes) -> tuple[int, ...]:
-        """The train ids of a request to be played. Raises RequestError for any other."""
-        run = self.run
-        asked = None if run.profile == "own" else published_requests.read(body)
         if self.spent:
             raise self._refusal()
+        run = self.run
         bounds = Bounds(
             n_env_instances=run.n_env_instances,
             min_episodes=run.min_episodes_per_submit,
             max_episodes=run.max_episodes_per_submit,
             remaining_budget=self.state.remaining_budget,
         )
-        return parse(body, bounds) if asked is None else published_requests.check(asked, bounds)
+        return self._begin(
+            Requested(
+                key=key,
+                client_key=client_key,
+                body_digest=digest_of(body),
+                env_instances=parse(body, bounds),
+                bundle=None,
+                bundle_error=None,
+            )
+        )
 
     def _begin(self, request: Requested) -> Ticket:
         index, n = len(self.tickets), len(request.env_instances)
@@ -241,14 +226,9 @@ class TicketMachine:
         """The effect that the ticket in flight needs in its state; None without one."""
         if self.in_flight is None:
             return None
-        request, rejected = self.in_flight.request, self.in_flight.request.rejected
         if self.in_flight.requested_at is None:
-            return request if rejected else "snapshot"
-        if self.in_flight.accepted is None:
-            return "send"
-        if rejected and not rejected.folder:
-            return open_run.Settled(key=request.key, status=rejected.status, summary="")
-        return "collect"
+            return "snapshot"
+        return "send" if self.in_flight.accepted is None else "collect"
 
     def snapshotted(self, snapshot: Snapshot) -> Effect:
         more = {"bundle_error": snapshot.error, "kept": snapshot.kept, "tree": snapshot.tree}
@@ -316,18 +296,14 @@ class TicketMachine:
         return self.next()
 
     def _settle(self, ticket: Ticket, entry: open_run.Settled, place: int) -> None:
-        error = None
-        if entry.summary:
-            decoded = msgspec.json.decode(entry.summary, type=_SummaryPart)
-            ticket.status, ticket.place, ticket.waits_for = entry.status, place, ""
-            ticket.policy_failures, ticket.warning = decoded.policy_failures, decoded.warning
-            mean, ticket.n_done = decoded.mean_return, ticket.n_episodes
-            ticket.mean = mean if isinstance(mean, float | int) and math.isfinite(mean) else None
-            # To save memory: a run has thousands of episodes.
-            ticket.request = msgspec.structs.replace(ticket.request, env_instances=())
-        elif ticket.request.rejected is not None:
-            error = RequestError(entry.status, ticket.request.rejected.message)
-        self._end(error)
+        decoded = msgspec.json.decode(entry.summary, type=_SummaryPart)
+        ticket.status, ticket.place, ticket.waits_for = entry.status, place, ""
+        ticket.policy_failures, ticket.warning = decoded.policy_failures, decoded.warning
+        mean, ticket.n_done = decoded.mean_return, ticket.n_episodes
+        ticket.mean = mean if isinstance(mean, float | int) and math.isfinite(mean) else None
+        # To save memory: a run has thousands of episodes.
+        ticket.request = msgspec.structs.replace(ticket.request, env_instances=())
+        self._end(None)
 
     def _after_death(self, ticket: Ticket, failure: Exception) -> Effect:
         if self.deaths[ticket.request.key, None] < MAX_DEATHS:

@@ -6,7 +6,7 @@ from its gateway what the gateway never receives. A test walks every type in `Ga
 
 from __future__ import annotations
 
-from typing import Literal, get_args
+from typing import Literal
 
 import msgspec
 
@@ -21,12 +21,7 @@ from evopolicy_common.messages.environment import (
 from evopolicy_common.messages.episode import BlobRef, PolicyFailure, ResourceLimits, Tier
 from evopolicy_common.messages.worker import BlobAck, BlobChunk, BlobGet, BlobPut, Message, Refused
 
-RejectedStatus = Literal["budget_invalid", "invalid_env_instance"]
-"""Verdicts of requests that took a submit's index and play nothing, in the published profiles."""
-REJECTED: frozenset[str] = frozenset(get_args(RejectedStatus))
 SubmitStatus = Literal[
-    "budget_invalid",
-    "invalid_env_instance",
     "ok",
     "missing_policy",
     "denied_import",
@@ -35,8 +30,7 @@ SubmitStatus = Literal[
     "rollout_timeout",
     "cancelled",
 ]
-"""All verdicts are charged, except `cancelled` (the operator ended the run) and the first two
-(`RejectedStatus`)."""
+"""All verdicts are charged, except `cancelled`: the operator ended the run."""
 
 CANCELLED = "cancelled"
 """The `close_reason` of a run that its operator cancelled."""
@@ -171,8 +165,6 @@ class Submit(FromGateway, frozen=True, kw_only=True, tag="submit"):
     """Digest of the snapshot, uploaded beforehand; None when no snapshot of `system/` could be made."""
     bundle_error: PolicyFailure | None = None
     """Why there is no bundle: becomes the verdict, charged as `protocol.md` describes for a bundle without a Policy."""
-    rejected: RejectedStatus | None = None
-    """In the published profiles: the request takes an index, plays nothing, and has this verdict."""
     tree: Word = ""
     """Digest of the recorded workspace, from which other runs may start; empty: not recorded."""
     after: Int = 0

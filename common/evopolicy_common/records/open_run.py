@@ -12,7 +12,6 @@ from pathlib import Path
 import msgspec
 
 from evopolicy_common.messages.episode import PolicyFailure
-from evopolicy_common.messages.gateway import RejectedStatus
 from evopolicy_common.messages.run_settings import RunSettings
 
 STATE = ".gateway"
@@ -66,15 +65,6 @@ class Entry(msgspec.Struct, frozen=True, kw_only=True, tag_field="what"):
     """A line of the journal."""
 
 
-class Rejection(msgspec.Struct, frozen=True, kw_only=True):
-    """Why a request plays nothing."""
-
-    status: RejectedStatus
-    message: str
-    folder: bool
-    """Whether it gets a folder in the feedback."""
-
-
 class Requested(Entry, frozen=True, kw_only=True, tag="requested"):
     """A submit that passed the checks; written before anything of it is sent."""
 
@@ -92,10 +82,6 @@ class Requested(Entry, frozen=True, kw_only=True, tag="requested"):
     """As in `Snapshot`."""
     tree: str = ""
     """Digest of the workspace's tree (`records/policies/trees`); empty: not recorded."""
-    echoed: tuple[int | bool, ...] | None = None
-    """The ids as the summary shows them, where they are not `env_instances`."""
-    rejected: Rejection | None = None
-    """Set if the request takes an index and plays nothing."""
 
 
 class Accepted(Entry, frozen=True, kw_only=True, tag="accepted"):
@@ -113,7 +99,7 @@ class Settled(Entry, frozen=True, kw_only=True, tag="settled"):
     key: str
     status: str
     summary: str
-    """The text of `summary.json`, byte for byte; empty for a rejected request without a folder."""
+    """The text of `summary.json`, byte for byte."""
 
 
 class Refused(Entry, frozen=True, kw_only=True, tag="refused"):

@@ -8,6 +8,7 @@ aggregates are null, while `env_instances`, `n_episodes` and `remaining_budget` 
 from __future__ import annotations
 
 from datetime import UTC, datetime
+from typing import Literal
 
 import msgspec
 
@@ -27,13 +28,14 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
     """Index among the accepted submits, from 0."""
     env: str
     """Suite id, such as `gym/acrobot`."""
-    status: SubmitStatus
+    status: SubmitStatus | Literal["budget_invalid", "invalid_env_instance"]
+    """The last two: only of the published software, which gives a folder to some requests that it refuses."""
     n_episodes: int
     """Episodes charged; 0 when `cancelled`."""
     first_global_episode: int | None
     """Number of its first episode among the run's attempted episodes, from 0; null when not ok."""
     env_instances: tuple[int | bool, ...] | None
-    """Train ids in request order, repeats kept. In the published profiles `true` and `false` stand for 1 and 0."""
+    """Train ids in request order, repeats kept. The published software repeats a request's `true` and `false`."""
     remaining_budget: int
     """Episodes left after this submit."""
     submit_started_at: str

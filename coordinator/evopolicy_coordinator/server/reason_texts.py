@@ -89,7 +89,6 @@ TEXTS: Mapping[str, str | Callable[..., str]] = {
     "unknown_case": "env_instances names {case}; train cases are 0 to {last}",
     "too_few": "{n} episodes asked for; a submit takes at least {least}",
     "too_many": "{n} episodes asked for; a submit takes at most {most}",
-    "too_many_rejected": "{n} requests of this run took an index; further ones that play nothing do not",
     "over_budget": "{n} episodes asked for; {remaining} of the budget remain",
     "no_worker_yet": "the run waits for {waits_for}",
     "may_not_start": "the run's agent may not start yet; it waits for {waits_for}",

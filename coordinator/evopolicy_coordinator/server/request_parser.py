@@ -194,9 +194,8 @@ class RequestParser:
         checks.check_idempotency_key(m.key)
         sent = m.bundle is None or self._uploads.has_sent(m.run, m.bundle)
         checks.check_bundle(self._blobs, m.bundle, sent=sent)
-        whole = m.rejected is None or bool(m.env_instances)
         one = (m.bundle is None) != (m.bundle_error is None)
-        require(one or not whole, Refusal.BAD_MESSAGE, "a submit has either a bundle or a bundle_error")
+        require(one, Refusal.BAD_MESSAGE, "a submit has either a bundle or a bundle_error")
 
     def _check_poll(self, m: gateway.ResultsRequest) -> None:
         index = m.submit_index

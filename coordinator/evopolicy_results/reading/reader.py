@@ -22,7 +22,6 @@ from msgspec.structs import replace
 from evopolicy_common.errors import BundleError, ConfigError, ProtocolError
 from evopolicy_common.messages.bounds import check_plausible
 from evopolicy_common.messages.environment import Split
-from evopolicy_common.messages.gateway import REJECTED
 from evopolicy_common.records.aggregates import mean, std
 from evopolicy_common.records.newest import described
 from evopolicy_common.records.policies.checkpoints import CheckpointMeta, bundle_of, read_meta
@@ -213,7 +212,8 @@ def _read_submits(folder: Path, record: RunRecord) -> tuple[Submit, ...]:
             after = meta.remaining_budget_after
         else:
             raise UnreadableRunError(f"submit {index} has neither summary.json nor _meta.json")
-        if status in REJECTED:
+        # The published software gives a folder to some requests that it refuses.
+        if status in ("budget_invalid", "invalid_env_instance"):
             continue
         before, consumed = consumed, budget - after
         files, source = None, None

@@ -13,7 +13,6 @@ import msgspec
 
 from evopolicy_common.errors import ConfigError, ProtocolError
 from evopolicy_common.messages.environment import Split
-from evopolicy_common.messages.gateway import REJECTED
 from evopolicy_common.records.newest import described
 from evopolicy_common.records.policies.checkpoints import CheckpointMeta, read_meta
 from evopolicy_common.records.run_files import RUN_JSON, read_record, submit_folders
@@ -115,7 +114,6 @@ def read_run(root: Path) -> RunUnderTest:
         )
         for index, folder in sorted(folders.items())
     ]
-    submits = [submit for submit in submits if submit.status not in REJECTED]
     train = tuple(played for submit in submits if (played := _train(record, submit)))
     hidden = tuple(_hidden(record, {one.submit_index: one for one in train}))
     return RunUnderTest(root=root, record=record, submits=tuple(submits), train=train, hidden=hidden)

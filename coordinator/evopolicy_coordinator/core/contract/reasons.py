@@ -31,7 +31,6 @@ REFUSALS: dict[str, Refusal] = {
     "unknown_case": Refusal.INVALID_ENV_INSTANCE,
     "too_few": Refusal.BUDGET_INVALID,
     "too_many": Refusal.BUDGET_INVALID,
-    "too_many_rejected": Refusal.BUDGET_INVALID,
     "over_budget": Refusal.BUDGET_INVALID,
     "no_worker_yet": Refusal.NO_WORKER,
     "may_not_start": Refusal.UNAVAILABLE,

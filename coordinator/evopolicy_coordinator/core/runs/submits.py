@@ -29,9 +29,6 @@ from evopolicy_coordinator.core.tables.model import JobGroup, Run
 from evopolicy_coordinator.core.tables.state import State
 from evopolicy_coordinator.core.tables.step import EpisodesDone, Step, SubmitEnded
 
-MAX_REJECTED = 1000
-"""Requests of a run beyond its budget that take an index and play nothing; an agent could send any number."""
-
 
 def submit(state: State, event: events.Requested[gateway.Submit], step: Step) -> None:
     """Accept a submit, or refuse it for the first cause in the protocol's order; a known key
@@ -47,19 +44,15 @@ def submit(state: State, event: events.Requested[gateway.Submit], step: Step) ->
     requests.check_whole(run, message.after)
     if run.open is not None:
         raise NotDoneError("busy", submit=run.open)
-    if message.rejected is not None and run.row.settings.profile != "own":
-        if len(run.submits) >= run.row.budget + MAX_REJECTED:
-            raise NotDoneError("too_many_rejected", n=len(run.submits))
-    else:
-        check_request(
-            message.env_instances,
-            n_cases=len(run.row.train),
-            minimum=run.row.min_episodes_per_submit,
-            maximum=run.row.max_episodes_per_submit,
-            available=run.ledger.available,
-        )
-        if message.bundle is None and message.bundle_error is None:
-            raise NotDoneError("no_bundle")
+    check_request(
+        message.env_instances,
+        n_cases=len(run.row.train),
+        minimum=run.row.min_episodes_per_submit,
+        maximum=run.row.max_episodes_per_submit,
+        available=run.ledger.available,
+    )
+    if message.bundle is None and message.bundle_error is None:
+        raise NotDoneError("no_bundle")
     requests.demand_permit(state, run, step)
     _accept(state, run, event, step)
 
@@ -74,15 +67,14 @@ def _again(event: events.Requested[gateway.Submit], row: SubmitRow, step: Step) 
 
 def _accept(state: State, run: Run, event: events.Requested[gateway.Submit], step: Step) -> None:
     message = event.message
-    index, n = len(run.submits), 0 if message.rejected else len(message.env_instances)
+    index, n = len(run.submits), len(message.env_instances)
     first_global_episode = run.ledger.spent
-    if n:
-        run.ledger.reserve(index, n)
+    run.ledger.reserve(index, n)
     row = SubmitRow(
         run=run.id,
         submit_index=index,
         key=message.key,
-        env_instances=message.env_instances[:n],
+        env_instances=message.env_instances,
         bundle=message.bundle,
         tree=message.tree,
         first_global_episode=first_global_episode,
@@ -95,9 +87,6 @@ def _accept(state: State, run: Run, event: events.Requested[gateway.Submit], ste
     step.reply(event.request, shared(gateway.SubmitAccepted, row))
     step.log("info", "submit_accepted", run=run.id, submit=index, episodes=n, remaining=row.remaining_budget)
     failure = message.bundle_error
-    if message.rejected is not None:
-        step.change_submit(run, index, status=message.rejected, completed_at=step.now)
-        return
     if failure is not None:
         run.ledger.settle(index)
         status: SubmitStatus = "import_error"

@@ -12,7 +12,6 @@ from rigs.core_rig import Rig, done, split_of
 from evopolicy_common.messages.episode import FailureCategory, Job
 from evopolicy_common.messages.run_settings import PUBLISHED
 from evopolicy_coordinator.core.contract.records import SubmitRow
-from evopolicy_coordinator.core.runs.submits import MAX_REJECTED
 
 PROFILE = {**PUBLISHED, "profile": "published"}
 FAILURE: FailureCategory = "act_error"
@@ -126,33 +125,3 @@ def test_selection_in_an_invented_run_is_that_of_the_published_rule(seed: int) -
     best, scores = published_selection(validation, failed_train, failed_validation)
     assert (finished.best_submit_index, finished.val_scores) == (best, scores)
     assert finished.status == ("no_ok_submit" if best is None else "completed")
-
-
-def test_a_rejected_request_takes_an_index_without_a_charge_across_restarts(rig: Rig) -> None:
-    session = rig.register()
-    rig.create(budget=2, **PROFILE)
-    first = rig.submit(bundle=None, key="a", rejected="budget_invalid")
-    assert (first.submit_index, first.remaining_budget) == (0, 2)
-    assert rig.submit(bundle=None, key="a", rejected="budget_invalid") == first
-    rig.load()
-    session = rig.register()
-    assert rig.submit(0, 1, key="b").submit_index == 1
-    play_off(rig, session, lambda job: (1.0, False))
-    assert rig.submit(bundle=None, key="c", rejected="invalid_env_instance").submit_index == 2
-    rig.close()
-    play_off(rig, session, lambda job: (1.0, False))
-    finished = rig.finished()
-    assert [each.submit_index for each in finished.submits] == [1]
-    assert (finished.status, finished.best_submit_index, finished.budget_used) == ("completed", 1, 2)
-
-
-def test_rejected_requests_count_up_to_a_limit_in_published_profiles_only(rig: Rig) -> None:
-    rig.register()
-    rig.create(budget=1, **PROFILE)
-    answers = [
-        rig.submit(bundle=None, key=f"k{n}", rejected="budget_invalid") for n in range(MAX_REJECTED + 2)
-    ]
-    assert [each.submit_index for each in answers[:-1]] == list(range(MAX_REJECTED + 1))
-    assert answers[-1].status == "budget_invalid"
-    rig.create("r2")
-    assert rig.submit(run="r2", bundle=None, key="k", rejected="budget_invalid").status == "budget_invalid"

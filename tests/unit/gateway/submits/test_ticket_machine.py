@@ -86,7 +86,7 @@ class World:
         before = self.machine.in_flight
         self.n_asked += 1
         try:
-            ticket = self.machine.ask(body, client_key, f"key-{self.n_asked}")
+            self.machine.ask(body, client_key, f"key-{self.n_asked}")
         except RequestError as refusal:
             self.refusals.append((type(refusal), before))
             if (entry := self.machine.reject(refusal, 0.0)) is not None:
@@ -95,7 +95,7 @@ class World:
         assert before is None
         assert not self.ends
         self.effect = self.machine.next()
-        assert self.effect == "snapshot" or ticket.request.rejected is not None
+        assert self.effect == "snapshot"
 
     def perform(self, outcome: str) -> None:
         """Performs the effect, or lets it fail."""
@@ -132,7 +132,7 @@ class World:
         key = ticket.request.key
         assert ticket.request in self.journal
         assert self.sent.setdefault(key, ticket.request) == ticket.request
-        assert ticket.request.bundle or ticket.request.rejected
+        assert ticket.request.bundle
         if task == "send":
             assert ticket.accepted is None
             if outcome in REFUSALS:
