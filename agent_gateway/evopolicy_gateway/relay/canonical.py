@@ -1,7 +1,7 @@
 """The canonical form of a request, by which a replay recognises it. No I/O.
 
 `LEFT_OUT` names fields that differ between equal requests, by API; `TEXTS` replaces times and random names in all
-texts. docs/how-to/replay-an-agent.md lists both.
+texts. docs/how-to/replay.md lists both.
 """
 
 from __future__ import annotations

@@ -41,7 +41,7 @@ def blocks(page: str, language: str) -> list[str]:
     return [code for found, code in FENCE.findall((DOCS / page).read_text()) if found == language]
 
 
-def bash(code: str, folder: Path, **more: str) -> str:
+def bash(code: str, folder: Path, fails: int = 0, **more: str) -> str:
     own = {
         "XDG_STATE_HOME": str(folder / "state"),
         "WANDB_MODE": "offline",
@@ -57,8 +57,8 @@ def bash(code: str, folder: Path, **more: str) -> str:
         check=False,
         timeout=500,
     )
-    assert done.returncode == 0, (code, done.stdout, done.stderr)
-    return done.stdout
+    assert done.returncode == fails, (code, done.stdout, done.stderr)
+    return done.stderr if fails else done.stdout
 
 
 def test_the_page_about_other_tools_does_what_it_says(tmp_path: Path) -> None:
@@ -90,6 +90,27 @@ def test_the_page_about_other_tools_does_what_it_says(tmp_path: Path) -> None:
     # This suite file replaces the shipped one, which plays sixteen environments.
     (tmp_path / "smoke.toml").write_text(SUITE)
     assert "evolve/toy_line/smoke-0" in bash(f"{live}\nwait", tmp_path)
+
+
+def plain(text: str) -> str:
+    """The text without its numbers and widths."""
+    return re.sub(r"-?\d[\d.]*\*?", "N", re.sub(r" +", " ", text))
+
+
+def test_the_tutorial_on_an_environment_of_ones_own_prints_its_lines(tmp_path: Path) -> None:
+    page = "how-to/environment-tutorial.md"
+    for code in [*blocks(page, "python"), *blocks(page, "toml")]:
+        path = tmp_path / code.splitlines()[0].removeprefix("# ")
+        path.parent.mkdir(exist_ok=True)
+        path.write_text(code)
+    refused, *works = blocks(page, "bash")
+    error, table, checked, runs, _model = blocks(page, "")
+    assert error in bash(refused, tmp_path, fails=1)
+    shown = bash("\n".join(["export PYTHONPATH=$PWD", *works]), tmp_path)
+    lines = [*table.splitlines()[:6], *checked.splitlines(), *runs.splitlines()]
+    lines.pop(-4)  # how sure the search is to be better than random depends on the cases
+    assert [line for line in lines if plain(line) not in plain(shown)] == []
+    assert (tmp_path / "report/index.html").is_file()
 
 
 SMALL = "--budget 2 --validation 1 --heldout 1 --exp-id"

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import configparser
 import fnmatch
+import itertools
 import os
 import re
 import shlex
@@ -248,6 +249,20 @@ def test_only_the_workers_container_leaves_dockers_filters() -> None:
             else set()
         )
         assert "privileged" not in service
+
+
+def test_the_page_on_docker_has_the_options_of_the_compose_file() -> None:
+    page = (ROOT / "docs/how-to/docker.md").read_text()
+    worker = compose()["services"]["worker"]
+    (command,) = [block for block in re.findall(r"```\n(.*?)```", page, re.DOTALL) if "docker run" in block]
+    words = shlex.split(command.replace("\\\n", " "))
+    given = {after for word, after in itertools.pairwise(words) if word == "--security-opt"}
+    assert given == set(worker["security_opt"])
+    assert {"--read-only", "--cap-drop", "--init"} <= set(words)
+    assert set(re.findall(r"^\| `--security-opt (\S+)`", page, re.MULTILINE)) == given - {
+        "no-new-privileges:true"
+    }
+    parse(words[words.index("evopolicy", words.index("evopolicy") + 1) :])
 
 
 def test_docker_takes_the_compose_file() -> None:
