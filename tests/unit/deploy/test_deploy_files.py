@@ -262,7 +262,7 @@ def test_the_page_on_docker_has_the_options_of_the_compose_file() -> None:
     assert set(re.findall(r"^\| `--security-opt (\S+)`", page, re.MULTILINE)) == given - {
         "no-new-privileges:true"
     }
-    parse(words[words.index("evopolicy", words.index("evopolicy") + 1) :])
+    parse(words[words.index("evopolicy:latest") + 1 :])
 
 
 def test_docker_takes_the_compose_file() -> None:
