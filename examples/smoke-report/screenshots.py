@@ -1,5 +1,5 @@
-"""Screenshots of a report or of a live view in a headless Chromium, small enough to be kept: docs/how-to/reports.md shows
-them.
+"""Screenshots of a report or of a live view in a headless Chromium, small enough to be kept:
+docs/how-to/reports.md shows them.
 
 PYTHONPATH=tests/support python examples/smoke-report/screenshots.py REPORT|ADDRESS OUT
 
