@@ -52,7 +52,7 @@ _WORKS_S = 0.05
 """A process that has used so much more processor time since the last check has not hung, seconds."""
 _REMOVALS, _REMOVAL_S = 20, 0.1
 """How often the removal of a process's temporary files is tried, and the pause between, seconds."""
-_RENDERED_STEPS = 30
+_RENDERED_STEPS = 10
 """So many steps of an episode are also drawn."""
 _NONSENSE: tuple[Any, ...] = (None, "nonsense", float("nan"), 10**400, [[[]]], {"a": 1}, np.full(3, np.inf))
 
