@@ -43,8 +43,6 @@ class Option(msgspec.Struct, frozen=True, kw_only=True):
     """Type on the command line."""
     parse: Callable[[Any], Any] | None = None
     """Makes the field's value of that type's. Raises ConfigError."""
-    exists: bool = False
-    """The command line takes the path of an existing file only."""
     suite: Any = SAME
     """Type of the key in suite files, None: no key. A path is a text there."""
     python: bool = True

@@ -154,11 +154,11 @@ def unlike(then: Mapping[str, str], here: Mapping[str, str]) -> list[str]:
     ]
 
 
-def sample(sizes: Sequence[int], n: int, seed: int) -> list[tuple[int, tuple[int, ...]]]:
+def sample(sizes: Sequence[int], n: int) -> list[tuple[int, tuple[int, ...]]]:
     """Draws `n` episodes from lists of these sizes without replacement (all if there are fewer): the number
     of each list that has some, and their indexes in it."""
     everything = [(k, index) for k, size in enumerate(sizes) for index in range(size)]
     chosen: dict[int, list[int]] = {}
-    for k, index in sorted(random.Random(seed).sample(everything, min(n, len(everything)))):
+    for k, index in sorted(random.SystemRandom().sample(everything, min(n, len(everything)))):
         chosen.setdefault(k, []).append(index)
     return [(k, tuple(indexes)) for k, indexes in chosen.items()]

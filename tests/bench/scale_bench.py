@@ -229,18 +229,17 @@ class Run:
         credentials.write(found, self.folder.credentials)
         save(self.folder.opened_run, OpenedRun(run=run))
         self.process = stack.enter_context(
-            child(
-                "-m", "evopolicy_gateway.cli.serve", str(root), "--json", log=self.log, stdout=subprocess.PIPE
-            )
+            child("-m", "evopolicy_gateway.cli.serve", str(root), log=self.log, stdout=subprocess.PIPE)
         )
         self._url = ""
 
     def serving(self) -> None:
         """Waits until it serves."""
         assert self.process.stdout is not None
-        line = self.process.stdout.readline()
-        assert line, f"a gateway did not start: {self.log.read_text()}"
-        self._url = json.loads(line)["EVOPOLICYGYM_SUBMIT_URL"]
+        name = "EVOPOLICYGYM_SUBMIT_URL="
+        lines = iter(self.process.stdout.readline, "")
+        self._url = next((line for line in lines if line.startswith(name)), "").removeprefix(name).strip()
+        assert self._url, f"a gateway did not start: {self.log.read_text()}"
         (self.folder.system / "policy.py").write_text(POLICY)
 
     def submit(self, ids: list[int]) -> None:

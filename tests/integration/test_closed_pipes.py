@@ -58,7 +58,6 @@ def test_results_that_nobody_reads_end_their_commands_quietly(tmp_path: Path) ->
     for command in (
         "evopolicy-coordinator certs init --state state --host there",
         "evopolicy-worker doctor",
-        "evopolicy-worker doctor --json",
         "evopolicy data make --env gym/acrobot --root splits",
         "evopolicy data check splits",
         "evopolicy-coordinator certs issue worker gpu-7 --state state --out issued",

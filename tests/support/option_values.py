@@ -74,7 +74,7 @@ BASES = {
     "evopolicy run": ["--env=toy/line", "--agent=random", "--jail=none", "--tier=none", "--runs=played"],
     "evopolicy harbor": ["--http=127.0.0.1:TAKEN"],
     "evopolicy suite": ["{file}", "--runs=played"],
-    "evopolicy report": ["folder", "--out=report", "--no-pages", "--jobs=1"],
+    "evopolicy report": ["folder", "--out=report"],
     "evopolicy export": ["{runs}", "--to=csv"],
     "evopolicy publish": ["{runs}", "--out=new.evp"],
     "evopolicy leaderboard": ["{files}", "--out=board"],

@@ -144,7 +144,7 @@ LOCAL = ["evopolicy", "local", "--env", "toy", "--agent"]
             "no finished run in EMPTY; nothing written. Name run",
         ),
         (["evopolicy", "disk", "--state", "EMPTY"], "it has no coordinator.sqlite; name one with --state"),
-        (["evopolicy", "web", "--tls-certificate", "FILE", "--tls-key", "FILE"], "both in PEM"),
+        (["evopolicy", "web", "--tls-certificate", "FILE"], "both in PEM"),
         (["evopolicy-coordinator", "--state", "new", "--listen", "tcp/127.0.0.1:IN USE"], "with --listen"),
         (["evopolicy-coordinator", "certs", "revoke", "x", "--state", "EMPTY"], "certs init --state EMPTY"),
         (["evopolicy-worker", "check-env", "toy/line", "--results", "FILE/x"], "folder with --results"),

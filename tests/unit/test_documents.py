@@ -12,7 +12,8 @@ from functools import cache
 from pathlib import Path
 
 import pytest
-from documents import blocks_of_commands, commands, parse
+import typer
+from documents import APPS, blocks_of_commands, commands, parse
 
 from evopolicy_common import catalogue
 from evopolicy_coordinator.server.request_parser import REQUESTS
@@ -110,7 +111,8 @@ def test_commands_in_a_documents_blocks_are_taken(document: str) -> None:
 
 @pytest.mark.parametrize("document", DOCUMENTS)
 def test_options_that_a_document_names_are_ours(document: str) -> None:
-    ours = {option for _, command in commands() for each in command.params for option in each.opts}
+    every = [*(command for _, command in commands()), *map(typer.main.get_command, APPS.values())]
+    ours = {option for command in every for each in command.params for option in each.opts}
     code = [
         word for word in code_in(document) if " pytest " not in word and not word.startswith("systemd-run")
     ]

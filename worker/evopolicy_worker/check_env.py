@@ -30,19 +30,9 @@ from evopolicy_worker import environments
 from evopolicy_worker.environments.checks.conformance import SEEDS, CheckResult
 from evopolicy_worker.environments.checks.costs import Stretch, literal
 from evopolicy_worker.environments.interface.actions import compile_actions
-from evopolicy_worker.environments.interface.settings import use_browser
 from evopolicy_worker.slots.slot import Slot
 from evopolicy_worker.slots.tiers import available_tiers
 
-Browser = Annotated[
-    Path | None,
-    typer.Option(
-        exists=True,
-        dir_okay=False,
-        help="Chromium's program, for environments that are web pages; default: the machine's own.",
-    ),
-]
-"""The option of all commands of a worker."""
 HASH_SEEDS = ("0", "1")
 MOST_MEMORY_MB = 600
 """A slot whose processes need more is a fault: workers have a slot for each core."""
@@ -255,10 +245,11 @@ def command(
         list[str], typer.Argument(help="Environments, as for --env of a worker: ids, suites, globs, files.")
     ],
     steps: Annotated[int, typer.Option(min=1, help="Greatest number of steps of an episode.")] = 600,
-    browser: Browser = None,
     results: Annotated[
         Path | None,
-        typer.Option(help="File for results, one line of JSON each; results in it are not measured again."),
+        typer.Option(
+            hidden=True, help="File for results, one line of JSON each; results in it are not measured again."
+        ),
     ] = None,
 ) -> None:
     """Play environments and check that they follow the rules of the interface.
@@ -270,7 +261,6 @@ def command(
     also shows the time of a step, alone and in a worker's slot, and the memory of the slot. Environments run with your
     rights, except in the slot. Exit code 1 if one breaks a rule.
     """
-    use_browser(browser)
     with fail_on_our_errors():
         wanted = catalogue.resolve(env)
         if results is not None:

@@ -32,7 +32,7 @@ from evopolicy_common.processes.notices import notify_of_many_slots
 from evopolicy_common.processes.packages import checked_names, policy_versions
 from evopolicy_common.processes.preflight import check_scratch
 from evopolicy_common.processes.scratch import scratch_folder
-from evopolicy_common.terminal import say, say_json
+from evopolicy_common.terminal import say
 from evopolicy_common.wire import credentials, keys, transport
 from evopolicy_common.wire.credentials import read_ready
 from evopolicy_worker import capabilities, check_env, environments, setup
@@ -40,13 +40,12 @@ from evopolicy_worker.capabilities import Capabilities, describe_all, log_missin
 from evopolicy_worker.doctor import best_tier, examine
 from evopolicy_worker.environments.interface.calls import USUAL, Limits
 from evopolicy_worker.environments.interface.fingerprint import fingerprint
-from evopolicy_worker.environments.interface.settings import use_browser
 from evopolicy_worker.slots import cores
 from evopolicy_worker.slots.slot import Slot
 from evopolicy_worker.slots.tiers import SANDBOXED, available_tiers, try_out, why_not
 from evopolicy_worker.supervisor import MAX_PREPARED, Options, Supervisor
 
-app = App(add_completion=True)
+app = App()
 log: structlog.stdlib.BoundLogger = structlog.get_logger()
 
 
@@ -82,11 +81,9 @@ def work(
             "--credentials", help="Folder of `evopolicy-coordinator certs issue worker`, or the file in it."
         ),
     ] = None,
-    allow_package: Annotated[
+    policy_package: Annotated[
         list[str] | None,
         typer.Option(
-            "--policy-package",
-            "--allow-package",
             help="Package that policies may import in addition to numpy, as at the coordinator; may be repeated.",
         ),
     ] = None,
@@ -113,7 +110,6 @@ def work(
             help="Sandbox tier without which the worker does not start; it offers no other.",
         ),
     ] = None,
-    browser: check_env.Browser = None,
     env_timeout: Annotated[
         float,
         typer.Option(
@@ -139,7 +135,6 @@ def work(
     if context.invoked_subcommand is not None:
         return
     setup_logging()
-    use_browser(browser)
     with fail_on_our_errors():
         if not env:
             raise ConfigError(
@@ -147,7 +142,7 @@ def work(
             )
         if name is not None and not keys.valid_name(name):
             raise ConfigError(f"--name {name!r}: letters, digits, '.', '_' and '-' only, 63 at most")
-        packages = checked_names(allow_package)
+        packages = checked_names(policy_package)
         wanted = catalogue.resolve(env)
         environments.check_played(wanted)
         # Until the worker can drain, SIGTERM raises SystemExit, so that processes and temporary folders are cleaned up.
@@ -185,9 +180,7 @@ def work(
 
 
 @app.command("doctor")
-def doctor(
-    as_json: Annotated[bool, typer.Option("--json", help="Print the checks as JSON.")] = False,
-) -> None:
+def doctor() -> None:
     """Check which sandbox tiers work on this machine.
 
     Example: evopolicy-worker doctor
@@ -196,14 +189,11 @@ def doctor(
     """
     checks = tuple(examine())
     best = best_tier(checks)
-    if as_json:
-        say_json({"tier": best, "checks": checks})
-    else:
-        rows = [(each.name, each.verdict, each.found, each.advice) for each in checks]
-        terminal().print(filled_table(("check", "verdict", "found", "remedy"), rows))
-        say(
-            f"tier: {best or 'none (policies would not be locked in: a worker needs --unsandboxed, a run --tier none)'}"
-        )
+    rows = [(each.name, each.verdict, each.found, each.advice) for each in checks]
+    terminal().print(filled_table(("check", "verdict", "found", "remedy"), rows))
+    say(
+        f"tier: {best or 'none (policies would not be locked in: a worker needs --unsandboxed, a run --tier none)'}"
+    )
     raise typer.Exit(0 if best else 1)
 
 

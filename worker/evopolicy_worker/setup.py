@@ -36,10 +36,9 @@ from evopolicy_common.errors import ConfigError, MachineError
 from evopolicy_common.processes.parent_death import ending_with_parent
 from evopolicy_common.processes.preflight import check_writable
 from evopolicy_common.terminal import one_line, say
-from evopolicy_worker.check_env import Browser
 from evopolicy_worker.environments.browser import chromium
 from evopolicy_worker.environments.checks.conformance import CheckResult
-from evopolicy_worker.environments.interface.settings import BROWSER, use_browser
+from evopolicy_worker.environments.interface.settings import BROWSER
 
 DISTRIBUTION = "evopolicy"
 _PIP = ("-m", "pip", "--disable-pip-version-check", "--no-input")
@@ -61,7 +60,6 @@ def command(
     python: Annotated[
         str | None, typer.Option(help="Interpreter of the virtual environment; default: this one.")
     ] = None,
-    browser: Browser = None,
 ) -> None:
     """Install families of environments, in tested versions, into a virtual environment of their own.
 
@@ -70,7 +68,6 @@ def command(
     Use this for families whose packages conflict with those installed here, or to keep this installation unchanged.
     Local commands find it and start a worker from it. For web pages, root also installs Chromium.
     """
-    use_browser(browser)
     with fail_on_our_errors(), contextlib.ExitStack() as stack:
         wanted = _wanted(family)
         folder = (into or installs.root() / "+".join(wanted)).absolute()
@@ -167,8 +164,8 @@ def install_browser() -> None:
         if program is install and done.returncode == 0 and not chromium.lacking():
             return
     raise MachineError(
-        f"chromium cannot be installed: {last_line(done.stderr + done.stdout)}; install it by hand, or name one with"
-        " --browser PATH"
+        f"chromium cannot be installed: {last_line(done.stderr + done.stdout)}; install it by hand, or name one in"
+        " EVOPOLICY_BROWSER"
     )
 
 

@@ -69,8 +69,8 @@ GROUPS = {
     "Cluster": {
         "status": "Show workers, runs, and the reasons why runs wait.",
         "web": "Show sweeps, runs and the cluster in a browser, live.",
-        "workers": "List, drain, pause and resume workers.",
-        "runs": "List, cancel and repin runs.",
+        "workers": "Drain, pause and resume workers.",
+        "runs": "Cancel and repin runs.",
         "envs": "List the environments that the cluster's workers offer, their definitions, and"
         " whether runs may use them.",
         "disk": "Show the disk space of stored runs by environment, and whether a planned sweep fits.",

@@ -58,11 +58,10 @@ _LOCAL_ONLY = {
     " coordinator: evopolicy-coordinator --hidden-isolation",
     "policy_package": "--policy-package is for a cluster that this command brings up; give it to"
     " evopolicy-coordinator and to each evopolicy-worker",
-    "browser": "--browser is for a cluster that this command brings up; give it to each evopolicy-worker",
     **dict.fromkeys(
         ("env_timeout", "env_memory"),
-        "--env-timeout and --env-memory are for a cluster that this command brings up; give them to each"
-        " evopolicy-worker",
+        "env_timeout and env_memory are for a cluster that this command starts; give --env-timeout and --env-memory"
+        " to each evopolicy-worker",
     ),
 }
 """Refusals of options of a local cluster where another one is used."""
@@ -83,9 +82,7 @@ def cluster_of(
     if given.fresh and given.state is not None:
         raise ConfigError(f"--fresh and --state {given.state}: give only one of them")
     state = None if given.fresh else given.state or local_state_dir()
-    browser = None if given.browser is None else given.browser.absolute()
-    options = msgspec.structs.replace(given, state=state, browser=browser, policy_package=packages)
-    return Cluster(local=options)
+    return Cluster(local=msgspec.structs.replace(given, state=state, policy_package=packages))
 
 
 class Shown(NamedTuple):
@@ -167,8 +164,6 @@ def _parameter(one: Declared, text: str) -> inspect.Parameter:
         metavar=option.metavar,
         help=f"{text.rstrip('.')}; may be repeated." if kind == Several else text,
         rich_help_panel=one.group,
-        exists=option.exists,
-        dir_okay=not option.exists,
         show_default=one.default is not msgspec.NODEFAULT,
     )
     return inspect.Parameter(

@@ -15,7 +15,7 @@ from evopolicy_common.console import terminal
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.messages.episode import ResourceLimits, Tier
 from evopolicy_common.processes.preflight import LOCAL, check_installed
-from evopolicy_common.records.run_difference import differences, left_out, shortened
+from evopolicy_common.records.run_difference import differences, shortened
 from evopolicy_common.terminal import say_json, say_lines
 from evopolicy_gateway import shipped
 from evopolicy_gateway.cli import options
@@ -38,7 +38,6 @@ from evopolicy_gateway.suite import runs as plain_runs
 from evopolicy_gateway.suite.suite_index import exit_code
 
 app = App()
-_FOR_TRIES = Shown(without=("hidden_isolation", "env_timeout", "env_memory"))
 
 
 @app.command(epilog="Example: evopolicy run --env gym/acrobot --agent evolve --credentials operator-me")
@@ -48,11 +47,9 @@ def run(
     env: options.Env,
     connect: Connect = None,
     credentials_file: CredentialsFile = None,
-    local: options.Local = False,
     given: RunOptions,
     jail: JailSettings,
     served: ListenerOptions,
-    cluster: Annotated[ClusterOptions, Shown(without=("env_timeout", "env_memory"))],
     web: options.Web = False,
     as_json: options.Json = False,
 ) -> None:
@@ -61,22 +58,11 @@ def run(
     Opens the run at the coordinator, starts its gateway and its agent on this machine, and ends when run.json is
     written.
     """
-    if local and (connect or credentials_file):
-        raise ConfigError(
-            "--local starts a cluster of its own; it cannot be combined with --connect or --credentials"
-        )
-    if not local and (cluster.data is not None or cluster.state is not None or cluster.fresh):
-        raise ConfigError(
-            "--data, --state and --fresh apply only with --local; otherwise set them at the coordinator:"
-            " evopolicy-coordinator --data, --state"
-        )
-    if local:
-        check_installed(LOCAL)
-    where = options.cluster_of(cluster, connect, credentials_file, local=local)
+    where = Cluster(connect=tuple(connect or ()), file=credentials_file, patient=given.resume)
     held = jail.of_remote_agent() if given.agent == listener.AGENT else jail
     agent_host = listener.agent_host_of(given.agent, served.agent_host)
     plans = _plans(given, [one_environment(env)], agent_host, jail=held, listener=served.listener())
-    _play(plans, msgspec.structs.replace(where, patient=given.resume and not local), 1, as_json, web=web)
+    _play(plans, where, 1, as_json, web=web)
 
 
 @app.command(epilog="Example: evopolicy local --env core16 --agent evolve --budget 8 --parallel 2")
@@ -108,8 +94,6 @@ def local(
 def demo(
     *,
     runs: Annotated[Path, typer.Option(help="Folder of run directories.")] = Path("runs"),
-    slots: Annotated[int, Of(ClusterOptions)],
-    as_json: options.Json = False,
 ) -> None:
     """Play one run on this machine: the agent evolve on gym/continuouscar, 32 episodes. Takes about a minute.
 
@@ -118,8 +102,8 @@ def demo(
     check_installed(LOCAL)
     given = RunOptions(agent="evolve", budget=32, exp_id="demo", overwrite=True, runs=runs)
     plans = _plans(given, ["gym/continuouscar"])
-    where = options.cluster_of(ClusterOptions(slots=slots), None, None, local=True)
-    _play(plans, where, 1, as_json)
+    where = options.cluster_of(ClusterOptions(), None, None, local=True)
+    _play(plans, where, 1, as_json=False)
 
 
 @app.command(
@@ -167,26 +151,11 @@ def try_policy(
     raise typer.Exit(run_to_end(trials.try_policy(env_id, policy, ids, out, where, **given)))
 
 
-def _tell_left_out(wanted: bool) -> None:
-    if wanted:
-        say_lines(left_out())
-        raise typer.Exit
-
-
 @app.command("diff", epilog="Example: evopolicy diff runs/evolve/gym_acrobot/a runs/evolve/gym_acrobot/b")
 def diff_runs(
     left: Annotated[Path, typer.Argument(exists=True, file_okay=False, help="A run directory.")],
     right: Annotated[Path, typer.Argument(exists=True, file_okay=False, help="Another run directory.")],
-    as_json: Annotated[bool, typer.Option("--json", help="Print the differences as JSON.")] = False,
-    _: Annotated[
-        bool,
-        typer.Option(
-            "--left-out",
-            is_eager=True,
-            callback=_tell_left_out,
-            help="Print the values that are not compared, and why.",
-        ),
-    ] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print all differences, as JSON.")] = False,
 ) -> None:
     """Compare two run directories, except for times, logs and other values that differ between equal runs.
 
@@ -221,7 +190,10 @@ def replay(
     ] = False,
     connect: Connect = None,
     credentials_file: CredentialsFile = None,
-    cluster: Annotated[ClusterOptions, _FOR_TRIES],
+    cluster: Annotated[
+        ClusterOptions,
+        Shown(without=("slots", "hidden_isolation", "policy_package", "env_timeout", "env_memory")),
+    ],
 ) -> None:
     """Play a recorded run again: the same agent, with its model's answers from the record.
 
@@ -231,6 +203,9 @@ def replay(
     plan = recorded_agent.plan_of(folder_of(run_directory).root, runs, trusted=trust)
     plan.check()
     where = options.cluster_of(cluster, connect, credentials_file)
+    if where.local is not None:
+        local = msgspec.structs.replace(where.local, policy_package=list(packages_for(run_directory, None)))
+        where = msgspec.structs.replace(where, local=local)
     try:
         run_to_end(plain_runs.play([plan], where, 1, terminal(stderr=True)))
     except KeyboardInterrupt:

@@ -11,7 +11,6 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any
 
-import orjson
 import typer
 
 from evopolicy_common.cli.conventions import FAILURE, code_of, fail_on_our_errors, setup_logging
@@ -30,23 +29,13 @@ from evopolicy_gateway.submits.tickets import TicketMachine
 from evopolicy_gateway.workspace import staging as workspace
 from evopolicy_gateway.workspace.agents_md import Urls
 
-app = App(add_completion=True)
+app = App()
 log: structlog.stdlib.BoundLogger = structlog.get_logger()
 
 
 @app.command()
 def serve(
     run_directory: Annotated[Path, typer.Argument(help="Directory of an open run.", show_default=False)],
-    connect: Annotated[
-        list[str] | None, typer.Option(help="Endpoint of the coordinator; default: the one in the directory.")
-    ] = None,
-    credentials_file: Annotated[
-        Path | None,
-        typer.Option(
-            "--credentials",
-            help="Folder of `evopolicy-coordinator certs issue gateway`; default: the credentials in the directory.",
-        ),
-    ] = None,
     agent_host: Annotated[
         str | None,
         typer.Option(
@@ -58,9 +47,6 @@ def serve(
             ),
         ),
     ] = None,
-    json_output: Annotated[
-        bool, typer.Option("--json", help="Print the variables as one JSON object.")
-    ] = False,
     controlled: Annotated[
         bool,
         typer.Option("--controlled", hidden=True, help="Speak with a parent process over stdin and stdout."),
@@ -81,8 +67,7 @@ def serve(
         place = None if agent_host is None else place_of(agent_host)
         # The command that controls a gateway holds the folder for both.
         with contextlib.nullcontext() if controlled else alone(folder.lock, folder.root):
-            known = (folder, tuple(connect or ()), credentials_file)
-            closed = asyncio.run(_serve(known, place, json_output, controlled))
+            closed = asyncio.run(_serve(folder, place, controlled))
     sys.stdout.flush()
     # A thread that still reads stdin, or a session that cannot be closed, must not hold up the exit. Status 0 tells
     # the parent that the coordinator has closed the run.
@@ -103,22 +88,15 @@ def _failures_in_the_log() -> Iterator[None]:
         raise SystemExit(FAILURE) from error
 
 
-async def _serve(
-    known: tuple[RunFolder, tuple[str, ...], Path | None],
-    place: AgentPlace | None,
-    json_output: bool,
-    controlled: bool,
-) -> bool:
+async def _serve(folder: RunFolder, place: AgentPlace | None, controlled: bool) -> bool:
     def ready(urls: Urls, pipeline: SubmitPipeline) -> None:
-        variables = urls.environment() | workspace.variables(known[0])
+        variables = urls.environment() | workspace.variables(folder)
         if controlled:
             opened = pipeline.machine.run
             why = f"--video {opened.video}: {opened.env.env} does not render; there are no videos"
             notes = (why,) if opened.video != "off" and not opened.env.renders else ()
             times = {"held_s": round(pipeline.machine.held_s, 3), "permit_s": round(gateway.permit_s, 3)}
             child_messages.emit(Ready(variables=urls.environment(), notes=notes, **times))
-        elif json_output:
-            print(orjson.dumps(variables).decode(), flush=True)
         else:
             print("".join(f"{name}={value}\n" for name, value in variables.items()), end="", flush=True)
 
@@ -139,7 +117,7 @@ async def _serve(
             print(f"waiting for {what}", file=sys.stderr, flush=True)
 
     calls: dict[str, Any] = {"on_ready": ready, "on_change": changed, "on_wait": waits}
-    gateway = Gateway(*known, **calls, alone=not controlled, place=place)
+    gateway = Gateway(folder, **calls, alone=not controlled, place=place)
     loop = asyncio.get_running_loop()
     for number in (signal.SIGTERM, signal.SIGINT):
         loop.add_signal_handler(number, gateway.tell, None)

@@ -86,7 +86,7 @@ async def reached(where: Cluster, workers: Workers | None = None) -> AsyncIterat
         local: LocalCluster | None = None
         file, opened = where.file, None
         if (chosen := where.local) is not None:
-            names = ("state", "data", "hidden_isolation", "browser", "env_timeout", "env_memory")
+            names = ("state", "data", "hidden_isolation", "env_timeout", "env_memory")
             given: dict[str, Any] = {name: getattr(chosen, name) for name in names}
             given |= {"unjailed": where.unjailed, "policy_packages": tuple(chosen.policy_package or ())}
             starting = local_cluster("local", workers=workers, **given)

@@ -19,10 +19,7 @@ import asyncio
 import contextlib
 import time
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
-
-import msgspec
 
 from evopolicy_common.errors import ConfigError, RefusedError
 from evopolicy_common.logs import structlog
@@ -52,8 +49,6 @@ class Gateway:
     def __init__(
         self,
         folder: RunFolder,
-        connect: tuple[str, ...] = (),
-        credentials_file: Path | None = None,
         *,
         on_ready: Callable[[Urls, SubmitPipeline], None],
         on_change: Callable[[SubmitPipeline], None],
@@ -61,13 +56,10 @@ class Gateway:
         alone: bool,
         place: AgentPlace | None = None,
     ) -> None:
-        """`connect` and `credentials_file` (its folder) replace those of the run; the run's capability stays.
-
-        `on_wait` receives the reason for waiting, other than the agent, or an empty text when the wait is over.
+        """`on_wait` receives the reason for waiting, other than the agent, or an empty text when the wait is over.
         `alone`: no other process watches the agent. `place`: where the agent is, when it differs from the run's folder.
         """
         self._folder = folder
-        self._place_of_credentials = connect, credentials_file
         self._on_ready, self._on_change, self._on_wait = on_ready, on_change, on_wait
         self._alone, self._place = alone, place
         self._stopped = asyncio.Event()
@@ -87,7 +79,7 @@ class Gateway:
     async def run(self) -> bool:
         """Serves until `tell`; returns whether the run was closed. Raises errors that make serving impossible."""
         folder = self._folder
-        own, known = _load(folder, *self._place_of_credentials)
+        own, known = _load(folder)
         run, self._place = known.run, self._place or agent_place(folder)
         if folder.closing.exists():
             self.tell(saved(folder.closing, CloseRun))
@@ -192,16 +184,10 @@ class Gateway:
         return None
 
 
-def _load(
-    folder: RunFolder, connect: tuple[str, ...], file: Path | None
-) -> tuple[credentials.Credentials, OpenedRun]:
+def _load(folder: RunFolder) -> tuple[credentials.Credentials, OpenedRun]:
     if not folder.opened_run.exists():
         raise ConfigError(
             f"{folder.root} holds no open run ({folder.state.name}/{folder.opened_run.name} is missing);"
             " runs are opened by `evopolicy run`"
         )
-    own = credentials.read(folder.credentials)
-    run = saved(folder.opened_run, OpenedRun)
-    if file is not None:
-        own = msgspec.structs.replace(credentials.find("gateway", connect, file), token=own.token)
-    return credentials.at(own, connect), run
+    return credentials.at(credentials.read(folder.credentials), ()), saved(folder.opened_run, OpenedRun)

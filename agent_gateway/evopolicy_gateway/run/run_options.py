@@ -370,9 +370,7 @@ class ClusterOptions(msgspec.Struct, frozen=True, kw_only=True):
     the default), all (strict), or none (off)."""
     policy_package: Annotated[Several, Option(metavar="NAME")] = None
     """Package that policies may import in addition to numpy."""
-    browser: Annotated[Path | None, Option(exists=True)] = None
-    """Chromium's program for the local worker's web pages; default: the machine's own."""
-    env_timeout: Annotated[float | None, Meta(ge=1.0)] = None
+    env_timeout: Annotated[Seconds | None, RARE] = None
     """Time limit for one call of an environment, in seconds, as of evopolicy-worker; default: 300."""
-    env_memory: Annotated[int | None, Meta(ge=64)] = None
+    env_memory: Annotated[Annotated[int, Meta(ge=64)] | None, RARE] = None
     """Memory limit of an environment's process, in MiB, as of evopolicy-worker; default: 4096."""

@@ -55,7 +55,7 @@ class Workers(NamedTuple):
     """The options of a local cluster's workers; see `LocalCluster.start_workers`."""
 
     env_ids: Sequence[str]
-    slots: int
+    slots: int | None = None
     tiers: Collection[Tier] = ()
 
 
@@ -84,12 +84,13 @@ class LocalCluster:
             write_atomically(self._kept / run, "\n".join(map(str, locks)).encode(), mode=0o600)
 
     async def start_workers(
-        self, env_ids: Sequence[str], *, slots: int, tiers: Collection[Tier] = ()
+        self, env_ids: Sequence[str], *, slots: int | None = None, tiers: Collection[Tier] = ()
     ) -> None:
         """Starts a worker that offers these environments, or one from each virtual environment that they need, with all
         slots each: they are rarely busy at the same time, and a slot that waits for an episode takes no processor time.
 
-        `tiers`: sandbox tiers that will be used. If one does not work here, the cluster fails with the remedy.
+        `slots` None: one for each core. `tiers`: sandbox tiers that will be used. If one does not work here, the
+        cluster fails with the remedy.
         """
         await self._start_workers(Workers(env_ids, slots, tiers))
 
@@ -97,14 +98,14 @@ class LocalCluster:
 async def _start_workers(
     processes: _Processes, options: Sequence[str], credentials: Sequence[str], wanted: Workers
 ) -> None:
-    notify_of_many_slots(wanted.slots)
+    notify_of_many_slots(wanted.slots or 0)
     for python, env_ids in installs.divided(wanted.env_ids).items():
         # --unsandboxed: whoever starts this cluster also chooses the tiers of its runs.
         program = [*_module("evopolicy_worker.cli", python), "--grace", "1", "--unsandboxed", *credentials]
         program += [*options, *_options([("--env", catalogue.source_of(env_id)) for env_id in env_ids])]
         program += _options([("--need-tier", tier) for tier in sorted(wanted.tiers)])
         own = "" if python == sys.executable else f"-{Path(python).parents[1].name}"
-        await processes.keep_up(f"worker{own}", [*program, "--slots", str(wanted.slots)])
+        await processes.keep_up(f"worker{own}", [*program, *_options([("--slots", wanted.slots)])])
 
 
 @contextlib.asynccontextmanager
@@ -117,7 +118,6 @@ async def local_cluster(
     unjailed: bool = False,
     workers: Workers | None = None,
     policy_packages: Sequence[str] = (),
-    browser: Path | None = None,
     env_timeout: float | None = None,
     env_memory: int | None = None,
 ) -> AsyncIterator[LocalCluster]:
@@ -125,9 +125,8 @@ async def local_cluster(
 
     `kind` names its logs and its folder. `state` None: a temporary folder. `hidden_isolation`: the coordinator's
     option, None for its default. `unjailed`: agents could read the folder; see the coordinator's `--unjailed-agents`.
-    `policy_packages`: those that policies may import besides numpy. `browser`: the workers' Chromium; None for the
-    machine's own. `env_timeout`, `env_memory`: the workers' options (seconds, MiB), None for their defaults. `workers`:
-    workers to start at once, in parallel with the coordinator.
+    `policy_packages`: those that policies may import besides numpy. `env_timeout`, `env_memory`: the workers' options
+    (seconds, MiB), None for their defaults. `workers`: workers to start at once, in parallel with the coordinator.
     Raises ConfigError when the coordinator does not start (the folder may be in use).
     """
     with contextlib.ExitStack() as folders:
@@ -160,7 +159,7 @@ async def local_cluster(
         coordinator = [*_module("evopolicy_coordinator.cli"), *place, *_options(own.items()), *packages]
         if unjailed and state is not None:
             coordinator += ["--unjailed-agents"]
-        limits = {"--browser": browser, "--env-timeout": env_timeout, "--env-memory": env_memory}
+        limits = {"--env-timeout": env_timeout, "--env-memory": env_memory}
         worker_options = [*packages, *_options(limits.items())]
         processes = _Processes(root / "logs", kind, lock_fd)
         start = partial(_start_workers, processes, worker_options)

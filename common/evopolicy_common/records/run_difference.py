@@ -57,13 +57,6 @@ MAX_COMPARED_BYTES = 1 << 30
 """Larger files, in bytes, are not compared: an agent may leave huge sparse files."""
 
 
-def left_out() -> list[str]:
-    """The published list, one line per exclusion, with its reason."""
-    files = [f"{pattern}: {why}" for pattern, why in EXCLUDED_FILES.items()]
-    fields = EXCLUDED_FIELDS.items()
-    return files + [f"{file}, {name}: {why}" for file, names in fields for name, why in names.items()]
-
-
 def differences(left: Path, right: Path) -> list[str]:
     """One line per file or field in which two run directories differ; empty when they are the same run."""
     ours, theirs = _files(left), _files(right)

@@ -48,7 +48,7 @@ def bound(host: str, port: int) -> socket.socket:
 
 @contextlib.asynccontextmanager
 async def serving(
-    app: ASGIApp, sock: socket.socket, *, certificate: Path | None = None, private_key: Path | None = None
+    app: ASGIApp, sock: socket.socket, *, certificate: Path | None = None
 ) -> AsyncIterator[asyncio.Task[None]]:
     """Serves `app` inside the `async with`, and closes `sock`; the task ends early only when the service
     fails. Raises OSError when the address is taken by another listener."""
@@ -68,7 +68,6 @@ async def serving(
         timeout_graceful_shutdown=CLOSE_GRACE_S,
         h11_max_incomplete_event_size=32 << 10,
         ssl_certfile=certificate,
-        ssl_keyfile=private_key,
     )
     # It warns of every request that it cannot read, of which a client can send thousands a second.
     logging.getLogger("uvicorn.error").setLevel(logging.ERROR)

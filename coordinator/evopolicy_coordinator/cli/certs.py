@@ -10,23 +10,23 @@ from typing import Annotated
 
 import typer
 
-from evopolicy_common.cli.conventions import Json, State
+from evopolicy_common.cli.conventions import State
 from evopolicy_common.cli.frame import App
 from evopolicy_common.console import table, terminal
 from evopolicy_common.errors import ConfigError
-from evopolicy_common.terminal import counted, say, say_json
+from evopolicy_common.terminal import counted, say
 from evopolicy_common.wire.credentials import MachineRole, default_state_dir
 from evopolicy_coordinator.pki import certs, machines
-from evopolicy_coordinator.pki.machines import Machine, Machines
+from evopolicy_coordinator.pki.machines import Machines
 from evopolicy_coordinator.storage.state_folder import cluster_of
 
 app = App(help="Certificates for the machines of a cluster.", no_args_is_help=True)
 
 PORT = 7447
 """A coordinator's default address."""
+DAYS = {"coordinator": 730, "machine": 398}
+"""Validity of certificates."""
 _LOOPBACK = ("localhost", "127.0.0.1", "::1")
-
-Days = Annotated[int, typer.Option(min=1, max=3650, help="Validity of the certificate, in days.")]
 
 
 @app.command(epilog="Example: evopolicy-coordinator certs init --host coordinator.lab --host 10.0.0.5")
@@ -42,7 +42,6 @@ def init(
     cluster: Annotated[
         str | None, typer.Option(help="Name of the cluster, if the state folder is new [local].")
     ] = None,
-    days: Days = 730,
     renew: Annotated[
         bool,
         typer.Option("--renew", help="Renew the coordinator's certificate; those of machines stay valid."),
@@ -68,7 +67,9 @@ def init(
             " machine's folder"
         )
     hosts = host or (old.hosts if old is not None else _own_hosts())
-    machines.init(root, name, tuple(dict.fromkeys((*hosts, *_LOOPBACK))), _now(), days, anew=force)
+    machines.init(
+        root, name, tuple(dict.fromkeys((*hosts, *_LOOPBACK))), _now(), DAYS["coordinator"], anew=force
+    )
     made = _certificate(root)
     say(f"authority: {root}/certs/ca.pem{' (new: issue every machine again)' if force else ''}")
     say(f"coordinator: {', '.join(made.hosts)}, until {made.expires:%Y-%m-%d}")
@@ -92,14 +93,12 @@ def issue(
             help=f"Endpoint that the machine connects to; default: the coordinator's first --host, port {PORT}."
         ),
     ] = None,
-    days: Days = 398,
     renew: Annotated[
         bool,
         typer.Option(
             "--renew", help="Invalidate the folder issued earlier under this name, and make a new one."
         ),
     ] = False,
-    as_json: Json = False,
 ) -> None:
     """Write the folder that a machine needs to join: certificates, key, user and password.
 
@@ -114,11 +113,17 @@ def issue(
         tuple(connect or (usual,)),
     )
     made = machines.issue(
-        root, cluster, role, name, endpoints, folder, _now(), days, hosts=tuple(host or ()), again=renew
+        root,
+        cluster,
+        role,
+        name,
+        endpoints,
+        folder,
+        _now(),
+        DAYS["machine"],
+        hosts=tuple(host or ()),
+        again=renew,
     )
-    if as_json:
-        say_json({"folder": str(folder), "machines": [_facts(one) for one in made]}, indent=False)
-        return
     say(
         f"{folder}: {' and '.join(one.identity for one in made)}, until {made[0].expires:%Y-%m-%d}"
         f" (a secret: scp -rp {folder} MACHINE:)"
@@ -135,28 +140,20 @@ def issue(
 def revoke(
     name: Annotated[str, typer.Argument(help="NAME for all its roles, or ROLE/NAME.", show_default=False)],
     state: State = None,
-    as_json: Json = False,
 ) -> None:
     """Revoke a machine's certificate. The coordinator closes its connections within seconds and refuses new ones.
 
     Other workers play the jobs that its worker holds. Revoke at your routers as well, where there are any.
     """
     gone = machines.revoke(state or default_state_dir(), name, _now())
-    if as_json:
-        say_json([_facts(one) for one in gone], indent=False)
-    else:
-        say(f"revoked: {', '.join(one.identity for one in gone)}")
+    say(f"revoked: {', '.join(one.identity for one in gone)}")
 
 
-@app.command("list", epilog="Example: evopolicy-coordinator certs list --json")
-def list_(state: State = None, as_json: Json = False) -> None:
+@app.command("list", epilog="Example: evopolicy-coordinator certs list")
+def list_(state: State = None) -> None:
     """List all issued certificates, with expiry date and revocation."""
     root = state or default_state_dir()
     own, issued, now = _certificate(root), Machines(root).all(), _now()
-    if as_json:
-        coordinator = {"hosts": own.hosts, "expires": own.expires}
-        say_json({"coordinator": coordinator, "machines": [_facts(machine) for machine in issued]})
-        return
     shown = table("name", "role", "expires", "state")
     for name, role, expires, revoked in (
         (", ".join(own.hosts), "coordinator", own.expires, None),
@@ -166,12 +163,6 @@ def list_(state: State = None, as_json: Json = False) -> None:
         state_now = valid if revoked is None else f"revoked {revoked:%Y-%m-%d}"
         shown.add_row(name, role, f"{expires:%Y-%m-%d}", state_now)
     terminal().print(shown)
-
-
-def _facts(machine: Machine) -> dict[str, object]:
-    """A machine's public fields: neither its password nor its token."""
-    names = ("name", "role", "identity", "serial", "issued", "expires", "revoked")
-    return {name: getattr(machine, name) for name in names}
 
 
 def first_endpoint(root: Path) -> str:

@@ -15,7 +15,7 @@ import typer
 
 from evopolicy_common import catalogue
 from evopolicy_common.catalogue.worlds import unchanged
-from evopolicy_common.cli.conventions import Json, fail
+from evopolicy_common.cli.conventions import fail
 from evopolicy_common.cli.frame import App
 from evopolicy_common.console import table, terminal
 from evopolicy_common.errors import ConfigError, StorageError
@@ -23,7 +23,7 @@ from evopolicy_common.messages.environment import Split
 from evopolicy_common.messages.run_settings import MAX_HIDDEN
 from evopolicy_common.records import splits as split_files
 from evopolicy_common.records.blobs import write_atomically
-from evopolicy_common.terminal import counted, say, say_json
+from evopolicy_common.terminal import counted, say
 from evopolicy_coordinator import splits, worlds
 
 MAX_TRAIN = 1_000_000
@@ -60,7 +60,6 @@ def make(
         int | None, typer.Option(min=1, max=MAX_HIDDEN, help="Held-out cases [the suite's number].")
     ] = None,
     force: Annotated[bool, typer.Option("--force", help="Overwrite files that differ.")] = False,
-    as_json: Json = False,
 ) -> None:
     """Write train.json, valid.json and heldout.json of each environment."""
     planned = _plan(catalogue.resolve(env), root, seed, train, valid, heldout)
@@ -76,9 +75,6 @@ def make(
             write_atomically(path, planned[path], mode=0o600)
     except (OSError, StorageError) as error:
         fail(str(error))
-    if as_json:
-        say_json({"root": str(root), "written": [str(path) for path in written]}, indent=False)
-        return
     kept = len(planned) - len(written)
     same = f", {kept} {'was' if kept == 1 else 'were'} the same already" if kept else ""
     say(f"{counted(len(written), 'file')} written under {root}{same}")
@@ -109,10 +105,9 @@ def _plan(
     return planned
 
 
-@app.command(epilog="Example: evopolicy data check data --json")
+@app.command(epilog="Example: evopolicy data check data")
 def check(
     folder: Annotated[Path, typer.Argument(help="The root of a data tree, or one environment's folder.")],
-    as_json: Json = False,
 ) -> None:
     """Check that split files are well-formed and disjoint, and print their hashes."""
     if not folder.is_dir():
@@ -122,10 +117,7 @@ def check(
         fail(f"no train.json, valid.json or heldout.json in {folder} or in its folders")
     reports = [_report(item.resolve()) for item in folders]
     faulty = any(report["findings"] for report in reports)
-    if as_json:
-        say_json({"ok": not faulty, "environments": reports}, indent=False)
-    else:
-        _print(reports)
+    _print(reports)
     if faulty:
         raise typer.Exit(1)
 

@@ -35,17 +35,14 @@ _COLUMNS: dict[str, Callable[[OfferedEnvironment], str]] = {
 }
 
 
-@app.callback(invoke_without_command=True, epilog="Example: evopolicy envs --filter 'my/*'")
+@app.callback(invoke_without_command=True, epilog="Example: evopolicy envs --env 'my/*'")
 def envs(
     context: typer.Context,
     connect: Connect = None,
     file: CredentialsFile = None,
-    only: Annotated[
-        list[str] | None, typer.Option("--filter", help="Suite, or glob for ids; may be repeated.")
-    ] = None,
-    show: Annotated[
+    env: Annotated[
         str | None,
-        typer.Option(help="Show everything about the environment with this id, with its task text."),
+        typer.Option(help="Suite, glob for ids, or an id, which shows everything, with the task text."),
     ] = None,
     as_json: Json = False,
 ) -> None:
@@ -53,27 +50,26 @@ def envs(
     if context.invoked_subcommand is not None:
         return
     offered, later, failed = asking(connect, file, OperatorClient.environments)
-    patterns = [*(only or ()), *([show] if show else ())]
-    wanted = [each for each in offered if _wanted(each.description.env, patterns)]
-    later = {env: workers for env, workers in later.items() if _wanted(env, patterns)}
-    failed = {env: reasons for env, reasons in failed.items() if _wanted(env, patterns)}
+    wanted = [each for each in offered if _wanted(each.description.env, env)]
+    later = {each: workers for each, workers in later.items() if _wanted(each, env)}
+    failed = {each: reasons for each, reasons in failed.items() if _wanted(each, env)}
     if as_json:
         say_json(
             [
                 *wanted,
-                *({"env": env, "workers": workers, "described": False} for env, workers in later.items()),
-                *({"env": env, "failed": reasons} for env, reasons in failed.items()),
+                *({"env": each, "workers": workers, "described": False} for each, workers in later.items()),
+                *({"env": each, "failed": reasons} for each, reasons in failed.items()),
             ]
         )
         return
-    if show is not None:
-        _show(show, wanted, later, failed)
+    if env is not None and env not in catalogue.suites() and not set("*?[") & {*env}:
+        _show(env, wanted, later, failed)
         return
     shown = listing(wanted, _COLUMNS, right=("steps", "µs a step"), whole=("environment", "definition"))
-    for env, workers in later.items():
-        entry = catalogue.entry(env)
+    for each, workers in later.items():
+        entry = catalogue.entry(each)
         steps, names = f"{entry.max_episode_steps:,}", ", ".join(workers)
-        shown.add_row(env, _family(entry.family), "on first use", "", steps, "", "", "", names)
+        shown.add_row(each, _family(entry.family), "on first use", "", steps, "", "", "", names)
     if wanted or later:
         terminal().print(shown)
     elif not failed:
@@ -81,8 +77,8 @@ def envs(
     say_lines(_failures(failed))
     if wanted or later or failed:
         return
-    lacking = {env: installs.advice(env) for env in catalogue.entries() if only and _wanted(env, only)}
-    for line in dict.fromkeys(filter(None, lacking.values())):
+    lacking = [installs.advice(each) for each in catalogue.entries() if env and _wanted(each, env)]
+    for line in dict.fromkeys(filter(None, lacking)):
         say(line)
 
 
@@ -106,12 +102,11 @@ def _family(key: str) -> str:
     return catalogue.families().get(key, key)
 
 
-def _wanted(env: str, patterns: list[str]) -> bool:
+def _wanted(env: str, pattern: str | None) -> bool:
     suites = catalogue.suites()
-    return not patterns or any(
-        env in suites[each].environments if each in suites else fnmatch.fnmatchcase(env, each)
-        for each in patterns
-    )
+    if pattern in suites:
+        return env in suites[pattern].environments
+    return pattern is None or fnmatch.fnmatchcase(env, pattern)
 
 
 def _failures(failed: Mapping[str, Mapping[str, str]]) -> Iterator[str]:

@@ -72,18 +72,14 @@ def new(state: State = None) -> None:
     say("next: start the coordinator; runs on files (--data) are not concerned")
 
 
-def identity(state: State = None, as_json: Json = False) -> None:
+def identity(state: State = None) -> None:
     """Print the public key that signs this coordinator's published results; made on first use.
 
     Publish the key in a place that is known to be yours, so that others can pass it to `evopolicy check --identity`.
     """
     root = state or default_state_dir()
     _check_folder(root)
-    key = public_key(root)
-    if as_json:
-        say_json({"identity": key})
-    else:
-        say(key)
+    say(public_key(root))
 
 
 def countersign(

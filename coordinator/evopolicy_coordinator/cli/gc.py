@@ -10,10 +10,10 @@ from typing import Annotated
 import typer
 
 from evopolicy_common import catalogue
-from evopolicy_common.cli.conventions import Json, State, bytes_text
+from evopolicy_common.cli.conventions import State, bytes_text
 from evopolicy_common.cli.frame import App
 from evopolicy_common.processes.preflight import check_writable
-from evopolicy_common.terminal import counted, say, say_json
+from evopolicy_common.terminal import counted, say
 from evopolicy_common.wire.credentials import default_state_dir
 from evopolicy_coordinator.storage import disk_use
 
@@ -30,7 +30,6 @@ def collect(
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="Print what would be deleted, and delete nothing.")
     ] = False,
-    as_json: Json = False,
 ) -> None:
     """Delete stored episodes and bundles of runs that finished long ago, and unreferenced blobs.
 
@@ -40,9 +39,6 @@ def collect(
     if root.is_dir() and not dry_run:
         check_writable(root, "--state", may_be_full=True)
     done = disk_use.collect(root, older_than * 24 * 3600.0, dry_run=dry_run)
-    if as_json:
-        say_json(done, indent=False)
-        return
     verb = "would remove" if dry_run else "removed"
     say(
         f"{verb} {counted(done.episodes, 'episode')} of {counted(done.runs, 'run')} and"
@@ -63,7 +59,6 @@ def disk(
         int | None, typer.Option(min=1, help="Train episodes of each planned run; default: the suite's.")
     ] = None,
     runs: Annotated[int, typer.Option(min=1, help="Planned runs on each environment.")] = 1,
-    as_json: Json = False,
 ) -> None:
     """Show the disk space of stored runs by environment, and whether a planned sweep fits.
 
@@ -77,17 +72,14 @@ def disk(
     }
     needed = disk_use.estimate(root, planned) if planned else None
     directories = sum(catalogue.entry(env_id).feedback_bytes(n) for env_id, n in planned.items())
-    if as_json:
-        say_json({"environments": used, "planned": needed, "run_directories": directories}, indent=False)
-    else:
-        for each in used:
-            say(
-                f"{each.env:<32}{counted(each.runs, 'run'):>10}{counted(each.train_episodes, 'episode'):>18}"
-                f"{bytes_text(each.bytes):>12}{bytes_text(each.bytes_per_episode):>12} an episode"
-            )
-        if needed is not None:
-            more = f"; estimated without earlier runs: {', '.join(needed.guessed)}" if needed.guessed else ""
-            say(f"planned: about {bytes_text(needed.bytes)}, {bytes_text(needed.free_bytes)} are free{more}")
-            say(f"run directories, in addition: at most {bytes_text(directories)}")
+    for each in used:
+        say(
+            f"{each.env:<32}{counted(each.runs, 'run'):>10}{counted(each.train_episodes, 'episode'):>18}"
+            f"{bytes_text(each.bytes):>12}{bytes_text(each.bytes_per_episode):>12} an episode"
+        )
+    if needed is not None:
+        more = f"; estimated without earlier runs: {', '.join(needed.guessed)}" if needed.guessed else ""
+        say(f"planned: about {bytes_text(needed.bytes)}, {bytes_text(needed.free_bytes)} are free{more}")
+        say(f"run directories, in addition: at most {bytes_text(directories)}")
     if needed is not None and not needed.fits:
         raise typer.Exit(1)

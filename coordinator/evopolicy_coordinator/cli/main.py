@@ -11,11 +11,11 @@ from typing import Annotated, Literal
 import msgspec
 import typer
 
-from evopolicy_common.cli.conventions import Json, State, setup_logging
+from evopolicy_common.cli.conventions import State, setup_logging
 from evopolicy_common.cli.frame import App, Version, run_app
 from evopolicy_common.processes.packages import checked_names
 from evopolicy_common.records.blobs import announcing
-from evopolicy_common.terminal import counted, say, say_json
+from evopolicy_common.terminal import counted, say
 from evopolicy_common.wire.credentials import Ready, default_state_dir
 from evopolicy_coordinator.cli import certs as certs_cli
 from evopolicy_coordinator.cli import epochs as epochs_cli
@@ -26,7 +26,7 @@ from evopolicy_coordinator.server import process
 from evopolicy_coordinator.server.process import Options
 from evopolicy_coordinator.storage.backup import back_up
 
-app = App(add_completion=True)
+app = App()
 app.add_typer(certs_cli.app, name="certs")
 app.add_typer(epochs_cli.app, name="epoch")
 app.command(epilog="Example: evopolicy-coordinator identity --state /var/lib/evopolicy")(epochs_cli.identity)
@@ -71,13 +71,9 @@ def serve(
         ),
     ] = False,
     cluster: Annotated[str | None, typer.Option(help="Name of the cluster [local].")] = None,
-    allow_package: Annotated[
+    policy_package: Annotated[
         list[str] | None,
-        typer.Option(
-            "--policy-package",
-            "--allow-package",
-            help="Package that policies may import in addition to numpy; may be repeated.",
-        ),
+        typer.Option(help="Package that policies may import in addition to numpy; may be repeated."),
     ] = None,
     hidden_isolation: Annotated[
         Literal["related", "strict", "off"],
@@ -114,7 +110,9 @@ def serve(
     ] = None,
     ready_file: Annotated[
         Path | None,
-        typer.Option(help="When ready, write the addresses and credentials to this file, as JSON."),
+        typer.Option(
+            hidden=True, help="When ready, write the addresses and credentials to this file, as JSON."
+        ),
     ] = None,
     log_level: Annotated[
         Literal["debug", "info", "warning", "error"], typer.Option(help="Lowest level that is logged.")
@@ -123,6 +121,7 @@ def serve(
         bool,
         typer.Option(
             "--unjailed-agents",
+            hidden=True,
             help="Agents may be able to read this state folder: give their runs cases of their own, and later"
             " runs new cases.",
         ),
@@ -149,7 +148,7 @@ def serve(
         listen=tuple(listen or ()),
         insecure_tcp=insecure_tcp,
         cluster=cluster,
-        allowed_packages=checked_names(allow_package),
+        allowed_packages=checked_names(policy_package),
         unjailed=unjailed_agents,
         trust_workers=trust_workers,
         core=CoreSettings(
@@ -167,7 +166,6 @@ def serve(
 def backup(
     target: Annotated[Path, typer.Argument(help="New folder for the backup.", show_default=False)],
     state: State = None,
-    as_json: Json = False,
 ) -> None:
     """Copy the state folder: a consistent database, blobs and keys. The coordinator may be running.
 
@@ -176,10 +174,7 @@ def backup(
     state: they hold the hidden cases.
     """
     copied = back_up(state or default_state_dir(), target)
-    if as_json:
-        say_json(copied, indent=False)
-    else:
-        say(f"{copied.path}: database and {counted(copied.blobs, 'blob')}, {copied.bytes:,} bytes")
+    say(f"{copied.path}: database and {counted(copied.blobs, 'blob')}, {copied.bytes:,} bytes")
 
 
 async def _run(options: Options, announce: Callable[[bytes], None]) -> None:

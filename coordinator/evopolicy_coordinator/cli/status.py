@@ -8,32 +8,29 @@ from __future__ import annotations
 import asyncio
 import itertools
 import time
-from collections.abc import Awaitable, Callable, Iterator, Sequence
+from collections.abc import Awaitable, Callable, Iterator
 from pathlib import Path
 from typing import Annotated, Literal, TypeVar
 
 import typer
 from rich.console import Group, RenderableType
 from rich.live import Live
-from rich.table import Table
 from rich.text import Text
 
-from evopolicy_common import catalogue
 from evopolicy_common.cli.conventions import Connect, CredentialsFile, Json
 from evopolicy_common.cli.frame import App
 from evopolicy_common.console import listing, terminal
-from evopolicy_common.errors import ConfigError
 from evopolicy_common.messages.status import RunStatus, StatusReply, WorkerStatus
-from evopolicy_common.terminal import counted, duration, say, say_json, say_lines
+from evopolicy_common.terminal import counted, duration, say, say_json
 from evopolicy_common.wire import credentials, transport
 from evopolicy_common.wire.operator_client import OperatorClient
-from evopolicy_coordinator.web.content.remarks import abandoned, lacks, remarks
+from evopolicy_coordinator.web.content.remarks import remarks
 
 T = TypeVar("T")
 
 status_app = App(name="status", help="Show workers, runs, and the reasons why runs wait.")
-workers_app = App(name="workers", help="List, drain, pause and resume workers.", no_args_is_help=True)
-runs_app = App(name="runs", help="List, cancel and repin runs.", no_args_is_help=True)
+workers_app = App(name="workers", help="Drain, pause and resume workers.", no_args_is_help=True)
+runs_app = App(name="runs", help="Cancel and repin runs.", no_args_is_help=True)
 
 
 def asking(connect: list[str] | None, file: Path | None, work: Callable[[OperatorClient], Awaitable[T]]) -> T:
@@ -84,37 +81,11 @@ async def _watch_lines(operator: OperatorClient) -> None:
 
 
 WorkerName = Annotated[
-    str, typer.Argument(help="The worker's name, as `evopolicy workers list` shows it.", show_default=False)
-]
-Absent = Annotated[
-    bool, typer.Option("--absent", help="The worker is not connected; apply this when it reconnects.")
+    str, typer.Argument(help="The worker's name, as `evopolicy status` shows it.", show_default=False)
 ]
 RunId = Annotated[
-    str, typer.Argument(help="The run's id, as `evopolicy runs list` shows it.", show_default=False)
+    str, typer.Argument(help="The run's id, as `evopolicy status` shows it.", show_default=False)
 ]
-
-
-@workers_app.command("list", epilog="Example: evopolicy workers list")
-def list_workers(connect: Connect = None, file: CredentialsFile = None, as_json: Json = False) -> None:
-    """List the workers that are or recently were connected, with their environments."""
-    reply = asking(connect, file, OperatorClient.status)
-    if as_json:
-        say_json(reply.workers)
-        return
-    shown = ("worker", "host", "state", "slots", "running", "tiers", "environments")
-    terminal().print(_workers(reply, *shown) if reply.workers else "no worker is connected")
-    say_lines(line for worker in reply.workers for line in lacks(worker))
-
-
-def _names(env_ids: Sequence[str]) -> str:
-    """Environments in short form: a suite's name for all of a suite."""
-    remaining, names = set(env_ids), []
-    for suite in catalogue.suites():
-        members = set(catalogue.resolve([suite]))
-        if members <= remaining:
-            remaining -= members
-            names.append(suite)
-    return " ".join([*names, *(env_id for env_id in env_ids if env_id in remaining)])
 
 
 _WORKER_COLUMNS: dict[str, Callable[[WorkerStatus], str]] = {
@@ -126,36 +97,26 @@ _WORKER_COLUMNS: dict[str, Callable[[WorkerStatus], str]] = {
     "held": lambda one: str(one.held),
     "envs": lambda one: str(len(one.environments)),
     "tiers": lambda one: ", ".join([" ".join(one.tiers), *(f"no {tier}" for tier in one.missing_tiers)]),
-    "environments": lambda one: _names(one.environments),
     "class": lambda one: one.fingerprint,
     "seen": lambda one: f"{duration(one.last_seen_s)} ago",
 }
-
-
-def _workers(reply: StatusReply, *columns: str) -> Table:
-    shown = {name: _WORKER_COLUMNS[name] for name in columns}
-    right = ("slots", "running", "held", "envs")
-    return listing(reply.workers, shown, right=right, whole=("worker", "class"))
+_COUNTS = ("slots", "running", "held", "envs")
 
 
 def _command(name: str, state: Literal["active", "paused", "draining"], what: str) -> None:
     @workers_app.command(name, epilog=f"Example: evopolicy workers {name} lab-3f2a", help=what)
-    def command(
-        worker: WorkerName, connect: Connect = None, file: CredentialsFile = None, absent: Absent = False
-    ) -> None:
-        async def work(operator: OperatorClient) -> None:
-            if not absent:
-                reply = await operator.status()
-                known = {one.worker for one in reply.workers}
-                if worker not in known:
-                    raise ConfigError(
-                        f"no worker {worker!r} is connected; there are: {', '.join(sorted(known)) or 'none'}."
-                        " For a worker that will return, add --absent"
-                    )
+    def command(worker: WorkerName, connect: Connect = None, file: CredentialsFile = None) -> None:
+        async def work(operator: OperatorClient) -> set[str]:
+            reply = await operator.status()
             await operator.set_worker(worker, state)
+            return {one.worker for one in reply.workers}
 
-        asking(connect, file, work)
-        say(f"{worker} is {state}")
+        known = asking(connect, file, work)
+        if worker in known:
+            say(f"{worker} is {state}")
+        else:
+            connected = ", ".join(sorted(known)) or "none"
+            say(f"{worker} is not connected; it is {state} when it connects. Connected: {connected}")
 
 
 _command("drain", "draining", "Give a worker no more work. It finishes its episodes, then ends.")
@@ -165,28 +126,6 @@ _command(
     "Give a worker no more work until it is resumed. It finishes its episodes and stays connected.",
 )
 _command("resume", "active", "Give work again to a worker that was paused or drained.")
-
-
-@runs_app.command("list", epilog="Example: evopolicy runs list")
-def list_runs(connect: Connect = None, file: CredentialsFile = None, as_json: Json = False) -> None:
-    """List the unfinished runs, with the reasons why they wait."""
-    reply = asking(connect, file, OperatorClient.status)
-    if as_json:
-        say_json(reply.runs)
-        return
-    shown = listing(reply.runs, _RUN_COLUMNS | {"waits for": lambda run: run.waits_for}, whole=("run",))
-    terminal().print(shown if reply.runs else "no run is open")
-    say_lines(abandoned(reply.runs))
-
-
-_RUN_COLUMNS: dict[str, Callable[[RunStatus], str]] = {
-    "run": lambda run: run.run,
-    "entry": lambda run: run.entry,
-    "environment": lambda run: run.env,
-    "phase": lambda run: f"{run.phase}, abandoned" if run.abandoned else run.phase,
-    "budget left": lambda run: f"{run.remaining_budget}/{run.budget}",
-}
-"""The first columns of tables of runs."""
 
 
 @runs_app.command(epilog="Example: evopolicy runs cancel r-0f2e9a7c11d04b35")
@@ -241,16 +180,21 @@ def render(reply: StatusReply) -> RenderableType:
     )
     parts: list[RenderableType] = [
         Text(head),
-        _workers(reply, *(name for name in _WORKER_COLUMNS if name != "environments")),
+        listing(reply.workers, _WORKER_COLUMNS, right=_COUNTS, whole=("worker", "class")),
         *_classes(reply),
-        listing(reply.runs, _RUN_COLUMNS | _RUN_COUNTS, whole=("run",)),
+        listing(reply.runs, _RUN_COLUMNS, whole=("run",)),
     ]
     waits = [f"{run.run} waits for {run.waits_for}" for run in reply.runs if run.waits_for]
     lines = itertools.chain(waits, *remarks(reply).values())
     return Group(*parts, *(Text(line, style="yellow") for line in lines))
 
 
-_RUN_COUNTS: dict[str, Callable[[RunStatus], str]] = {
+_RUN_COLUMNS: dict[str, Callable[[RunStatus], str]] = {
+    "run": lambda run: run.run,
+    "entry": lambda run: run.entry,
+    "environment": lambda run: run.env,
+    "phase": lambda run: f"{run.phase}, abandoned" if run.abandoned else run.phase,
+    "budget left": lambda run: f"{run.remaining_budget}/{run.budget}",
     "submits": lambda run: str(run.n_submits),
     "queued": lambda run: str(run.queued),
     "running": lambda run: str(run.running),

@@ -48,10 +48,8 @@ def web(
         typer.Option(help="Additional host name for browsers; may be repeated.", show_default=False),
     ] = None,
     tls_certificate: Annotated[
-        Path | None, typer.Option(help="PEM file: serve HTTPS with this certificate.", show_default=False)
-    ] = None,
-    tls_key: Annotated[
-        Path | None, typer.Option(help="PEM file with its private key.", show_default=False)
+        Path | None,
+        typer.Option(help="PEM file with a certificate and its key: serve HTTPS.", show_default=False),
     ] = None,
     token_file: Annotated[
         Path | None,
@@ -82,13 +80,11 @@ def web(
     host, port = credentials.host_and_port(
         "--http", http, f"127.0.0.1:{DEFAULT_PORT}; port 0 takes a free one"
     )
-    for path in (tls_certificate, tls_key, report):
+    for path in (tls_certificate, report):
         if path is not None and not path.exists():
             raise ConfigError(f"{path} does not exist")
-    if tls_certificate is not None and tls_key is not None:
-        _check_certificate(tls_certificate, tls_key)
-    elif tls_certificate is not None or tls_key is not None:
-        raise ConfigError("give --tls-certificate and --tls-key together")
+    if tls_certificate is not None:
+        _check_certificate(tls_certificate)
     for folder in runs or ():
         if not folder.is_dir():
             raise ConfigError(f"{folder} is not a folder; name a folder of runs, such as runs")
@@ -123,20 +119,19 @@ def web(
         async def until_stopped() -> None:
             end_on_sigterm()
             with contextlib.suppress(asyncio.CancelledError):
-                await serve(site, sock, ready, certificate=tls_certificate, private_key=tls_key)
+                await serve(site, sock, ready, certificate=tls_certificate)
 
         asyncio.run(until_stopped())
 
 
-def _check_certificate(certificate: Path, key: Path) -> None:
-    for option, path in (("--tls-certificate", certificate), ("--tls-key", key)):
-        read_given(path, f"{option} {path}")
+def _check_certificate(certificate: Path) -> None:
+    read_given(certificate, f"--tls-certificate {certificate}")
     try:
-        ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER).load_cert_chain(certificate, key)
+        ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER).load_cert_chain(certificate)
     except OSError as error:
         raise ConfigError(
-            f"--tls-certificate {certificate} with --tls-key {key}: {error.strerror or error}; name a certificate and"
-            " its key, both in PEM"
+            f"--tls-certificate {certificate}: {error.strerror or error}; name a file with a certificate and its key,"
+            " both in PEM (cat cert.pem key.pem)"
         ) from error
 
 

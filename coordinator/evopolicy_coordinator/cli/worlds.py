@@ -50,7 +50,6 @@ def accept_worlds(
         Path, typer.Option(help="Folder of the canonical policies, each in the folder of its environment.")
     ] = Path("examples/policies"),
     state: State = None,
-    slots: Annotated[int, typer.Option(min=1, max=1024, help="Episodes played at the same time.")] = 2,
 ) -> None:
     """Choose the rules of an epoch's worlds: play candidates in a fixed order, and accept by a fixed rule.
 
@@ -64,17 +63,17 @@ def accept_worlds(
         raise ConfigError(f"{others[0]} has no worlds; those of Core16 have some: {', '.join(core16)}")
     with held(root):
         secret = splits.load_or_create_secret(root / splits.SECRET)
-        run_to_end(_accept(env_ids, policies, root / worlds.JOURNAL, secret, slots))
+        run_to_end(_accept(env_ids, policies, root / worlds.JOURNAL, secret))
     say(f"next: evopolicy-coordinator --state {root}")
 
 
-async def _accept(env_ids: list[str], policies: Path, journal: Path, secret: bytes, slots: int) -> None:
+async def _accept(env_ids: list[str], policies: Path, journal: Path, secret: bytes) -> None:
     end_on_sigterm()
     began = time.monotonic()
     with scratch_folder("worlds") as data:
         async with local_cluster("accept-worlds", data=data) as cluster:
             offered = [each for env in env_ids for each in (env, ids(env)[0])]
-            await cluster.start_workers(offered, slots=slots, tiers={"bwrap"})
+            await cluster.start_workers(offered, tiers={"bwrap"})
             operator = credentials.find("operator", (), cluster.operator_file)
             async with transport.connect(operator) as link:
                 trials = _Trials(journal, secret, data, Evaluations(link, lambda _, __: None, own=True))

@@ -73,7 +73,7 @@ def issue(
     if now + dt.timedelta(days=days) > parent.not_valid_after_utc:
         raise ConfigError(
             f"{days} days exceed the validity of the authority (until {parent.not_valid_after_utc:%Y-%m-%d});"
-            " ask for fewer with --days, or make a new authority with `certs init --force`"
+            " make a new authority with `certs init --force`"
         )
     if serves and not hosts:
         raise ConfigError(f"{common_name} needs a --host, the name or address that others dial it at")

@@ -110,7 +110,7 @@ class Definitions:
         raise RefusedError(
             Refusal.INVALID_SETTINGS,
             f"{env} does not ship with evopolicy, and its definition is not approved; workers offer {named}. Inspect it"
-            f" with `evopolicy envs --show {env}`, then give this name to --env, or approve it once: `evopolicy envs"
+            f" with `evopolicy envs --env {env}`, then give this name to --env, or approve it once: `evopolicy envs"
             f" approve {env}@{offers[0]}`",
         )
 

@@ -61,8 +61,8 @@ def _unknown_class(name: str, offered: tuple[str, ...]) -> str:
 
 
 TEXTS: Mapping[str, str | Callable[..., str]] = {
-    "unknown_run": "unknown run {run!r}; `evopolicy runs list` shows those that are not finished",
-    "no_unfinished_run": "no unfinished run {run!r}; `evopolicy runs list` shows them",
+    "unknown_run": "unknown run {run!r}; `evopolicy status` shows those that are not finished",
+    "no_unfinished_run": "no unfinished run {run!r}; `evopolicy status` shows them",
     "unknown_evaluation": "unknown evaluation {evaluation!r}",
     "run_cancelled": "run {run!r} was cancelled",
     "run_finished": "run {run!r} is finished",

@@ -33,12 +33,6 @@ State = Annotated[
         rich_help_panel=CLUSTER,
     ),
 ]
-Slots = Annotated[
-    int,
-    typer.Option(
-        min=1, max=1024, help="With --local: episodes played at the same time.", rich_help_panel=CLUSTER
-    ),
-]
 Runs = Annotated[
     list[Path], typer.Argument(metavar="RUNS...", help="Finished runs' directories, or folders of them.")
 ]
@@ -137,12 +131,13 @@ class Playing:
             self._progress.console.print(f"waits for {waits_for}")
 
     async def play(
-        self, envs: list[str], tiers: set[Tier], slots: int, work: Callable[[], Coroutine[Any, Any, None]]
+        self, envs: list[str], tiers: set[Tier], work: Callable[[], Coroutine[Any, Any, None]]
     ) -> None:
-        """Does the work. A cluster of the command's own gets workers first, and its failure ends the work."""
+        """Does the work. A cluster of the command's own gets workers first, with a slot for each core, and its failure
+        ends the work."""
         failed = None
         if self._cluster is not None:
-            await self._cluster.start_workers(envs, slots=slots, tiers=tiers)
+            await self._cluster.start_workers(envs, tiers=tiers)
             failed = self._cluster.failed
         await unless_failed(asyncio.create_task(work()), failed)
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import functools
-import random
 import re
 from collections.abc import Awaitable, Callable, Sequence
 from pathlib import Path
@@ -158,8 +157,6 @@ def check(
             " `evopolicy-coordinator countersign`; may be repeated.",
         ),
     ] = None,
-    seed: Annotated[int | None, typer.Option(help="Seed of the draw; default: random.")] = None,
-    slots: Annotated[int, typer.Option(min=1, max=1024, help="Episodes at the same time.")] = 2,
     as_json: Json = False,
 ) -> None:
     """Check published results.
@@ -177,7 +174,6 @@ def check(
         if policy_package and policy_share is None:
             fail("--policy-package goes with --policies")
         noted = [_noted(each) for each in head or ()]
-        drawn = random.SystemRandom().randrange(2**32) if seed is None else seed
         packages = frozenset(checked_names(policy_package))
         play_policies = functools.partial(replays.play_policies, packages=packages)
         try:
@@ -193,7 +189,7 @@ def check(
                     ("policies", play_policies, policy_share),
                 ):
                     if part is not None and not contradicts:
-                        partial = functools.partial(play, archive, checked, part, drawn, slots)
+                        partial = functools.partial(play, archive, checked, part)
                         asyncio.run(_play(kind, partial))
         except ProtocolError as error:
             raise ConfigError(f"{file}: {error}") from error

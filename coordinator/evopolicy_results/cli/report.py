@@ -21,7 +21,7 @@ from evopolicy_common.processes.preflight import check_writable
 from evopolicy_common.records.rescores import is_name
 from evopolicy_common.regular_files import read_given
 from evopolicy_common.terminal import counted, say, say_json, say_lines
-from evopolicy_results.reading.comparability import REMEDIES, UNKNOWN_ISOLATION, MixedRunsError
+from evopolicy_results.reading.comparability import REMEDIES, MixedRunsError
 from evopolicy_results.reading.parallel import Processes
 from evopolicy_results.reading.reader import load_runs, rescored
 from evopolicy_results.scoring.scores import read_score_csv
@@ -55,7 +55,6 @@ def report(
             help="Use the held-out scores of this re-score of `evopolicy rescore`; the report labels them post hoc.",
         ),
     ] = None,
-    title: Annotated[str | None, typer.Option(help="Heading of the report.")] = None,
     allow_mixed: Annotated[
         bool,
         typer.Option(
@@ -64,59 +63,31 @@ def report(
             " the report says so.",
         ),
     ] = False,
-    allow_unknown: Annotated[
-        bool,
-        typer.Option(
-            "--allow-unknown",
-            help="Compare runs without recorded hidden isolation, which are old, with newer ones; the report says so.",
-        ),
-    ] = False,
-    pages: Annotated[
-        bool,
-        typer.Option(
-            "--pages/--no-pages", help="Write a page for each run: feedback use, checkpoints, differences."
-        ),
-    ] = True,
-    jobs: Annotated[int, typer.Option(min=0, help="Number of processes; 0: one for each core.")] = 0,
     as_json: Json = False,
 ) -> None:
     """Write a report on finished runs: leaderboard, figures and diagnostics."""
     try:
         check_writable(out, "--out")
-        jobs = jobs or os.cpu_count() or 1
-        with Processes(jobs, "evopolicy_results.report", "evopolicy_results.figures.style") as processes:
+        with Processes(
+            os.cpu_count() or 1, "evopolicy_results.report", "evopolicy_results.figures.style"
+        ) as processes:
             # Here, not above: it needs jinja2, and `evopolicy` loads this module to list its commands.
             from evopolicy_results.report import write_report
 
             with _progress() as tell:
-                study = _study(runs, scores, allow_mixed, allow_unknown, processes, tell)
+                study = _study(runs, scores, allow_mixed, processes, tell)
                 index = None
                 if study.suites:
-                    index = write_report(
-                        study, out, title=title, traces=pages, processes=processes, progress=tell
-                    )
+                    index = write_report(study, out, processes=processes, progress=tell)
     except MixedRunsError as error:
         kinds = [one.what for one in error.mixtures]
-        options = sorted(
-            {"--allow-unknown" if kind == UNKNOWN_ISOLATION else "--allow-mixed" for kind in kinds}
-        )
         same = dict.fromkeys(REMEDIES[kind] for kind in kinds if kind in REMEDIES)
         advice = [f"Runs compare that were played with {'; '.join(same)}."] if same else []
         say_lines([f"error: {error}".splitlines()[0], *str(error).splitlines()[1:], *advice], err=True)
-        say(
-            f"Give the folders of runs that agree, or {' '.join(options)} to compare them all the same.",
-            err=True,
-        )
+        say("Give the folders of runs that agree, or --allow-mixed to compare them all the same.", err=True)
         raise SystemExit(MIXED) from error
     except ConfigError as error:
         fail(str(error), code_of(error))
-    old = [run for run in study.runs if run.record.hidden_isolation == "unknown" and not run.is_published]
-    if old:
-        say(
-            f"warning: {len(old)} of {len(study.runs)} runs do not tell whether hidden episodes and agents shared a"
-            " kernel; they are from before it was recorded",
-            err=True,
-        )
     if as_json:
         left_out = [{"path": str(item.path), "reason": item.reason} for item in study.left_out]
         place = str(index) if index is not None else None
@@ -137,7 +108,6 @@ def _study(
     paths: list[Path],
     rescore: str | None,
     allow_mixed: bool,
-    allow_unknown: bool,
     processes: Processes,
     tell: Tell,
 ) -> Study:
@@ -164,7 +134,6 @@ def _study(
         rescored(loaded.runs, rescore) if rescore else loaded.runs,
         left_out=loaded.left_out,
         allow_mixed=allow_mixed,
-        allow_unknown=allow_unknown,
         scores=scores,
     )
     tell("statistics", 1, 1)

@@ -24,7 +24,7 @@ from evopolicy_common.processes.packages import packages_in
 from evopolicy_common.records.rescores import is_name
 from evopolicy_common.records.run_files import no_run_below, run_folders
 from evopolicy_common.terminal import number, one_line, say, say_json
-from evopolicy_results.cli.cluster import Local, Runs, Slots, State, Where
+from evopolicy_results.cli.cluster import Local, Runs, State, Where
 from evopolicy_results.rescore.play import Finished, Wanted, Written, read_finished
 from evopolicy_results.rescore.play import rescore as rescore_run
 
@@ -70,7 +70,6 @@ def rescore(
     file: CredentialsFile = None,
     local: Local = False,
     state: State = None,
-    slots: Slots = 2,
     as_json: Json = False,
 ) -> None:
     """Play checkpoints of finished runs on further hidden cases, for tighter intervals.
@@ -115,7 +114,7 @@ def rescore(
                             failed.append(f"{run.folder}: {error}")
 
                 envs = sorted({run.record.env for run in finished})
-                await playing.play(envs, {run.record.sandbox_tier for run in finished}, slots, play)
+                await playing.play(envs, {run.record.sandbox_tier for run in finished}, play)
 
         try:
             run_to_end(work())

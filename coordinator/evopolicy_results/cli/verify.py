@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import random
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
@@ -22,10 +21,9 @@ from evopolicy_common.cli.conventions import (
 from evopolicy_common.cli.frame import App
 from evopolicy_common.console import Terminal, terminal
 from evopolicy_common.errors import ConfigError, EvopolicyError
-from evopolicy_common.messages.episode import Tier
 from evopolicy_common.processes.packages import packages_in
 from evopolicy_common.terminal import one_line, say_json
-from evopolicy_results.cli.cluster import Local, Slots, State, Where, first
+from evopolicy_results.cli.cluster import Local, State, Where, first
 from evopolicy_results.evaluations import sample as draw
 from evopolicy_results.verify.run import Difference, Report, Verifier
 from evopolicy_results.verify.source import read_run
@@ -44,7 +42,6 @@ def verify(
     sample: Annotated[
         int | None, typer.Option("--sample", min=1, help="Number of episodes, drawn at random; default: all.")
     ] = None,
-    seed: Annotated[int | None, typer.Option(help="Seed of the draw; default: random.")] = None,
     connect: Connect = None,
     file: CredentialsFile = None,
     local: Local = False,
@@ -56,17 +53,6 @@ def verify(
             rich_help_panel=CLUSTER,
         ),
     ] = None,
-    slots: Slots = 2,
-    tier: Annotated[
-        Tier | None, typer.Option(help="Sandbox tier of the workers' slots; default: the run's.")
-    ] = None,
-    policy: Annotated[
-        bool,
-        typer.Option(
-            "--policy/--no-policy",
-            help="Also play the checkpoints' policies again; their differences are advisory.",
-        ),
-    ] = True,
     as_json: Json = False,
 ) -> None:
     """Replay a run's recorded actions, and compare rewards, observations and returns bit for bit.
@@ -76,7 +62,6 @@ def verify(
     shows them. Returns of re-scores (rescore/NAME.json) are not played again. Exit codes: 0 identical, 1 something
     differs, 2 wrong usage or other cases than the run's, 3 could not be checked, or not all of it.
     """
-    seed = random.SystemRandom().randrange(2**32) if seed is None else seed
     where = Where(connect, file, local, state, data, runs=[run], needs_state=False)
     console = terminal(stderr=as_json)
 
@@ -85,36 +70,33 @@ def verify(
         finished = read_run(run)
         packages = packages_in(finished.record.versions.fingerprint)
         async with where.playing("verify", console, packages) as playing:
-            verifier = Verifier(playing.evaluations, finished, tier)
+            verifier = Verifier(playing.evaluations, finished)
             knows_run = await verifier.check_cases()
             lists = [*finished.train, *(finished.hidden if knows_run else ())]
             sizes = [len(played.env_instances) for played in lists]
             if verifier.skips(sum(sizes)):
                 return verifier.report
-            chosen = [(lists[k], indexes) for k, indexes in draw(sizes, sample or sum(sizes), seed)]
+            chosen = [(lists[k], indexes) for k, indexes in draw(sizes, sample or sum(sizes))]
             if not chosen:
                 raise ConfigError(f"{run} has no episode to play again, as no submit was ok")
             notes = verifier.report.notes
-            if sample is not None:
-                notes.append(f"the sample was drawn with --seed {seed}")
             if not knows_run:
                 notes.append(
                     "this coordinator has no record of the run: actions are those of the feedback files, hidden"
                     " episodes are not checked, policies get other seeds than they had, and edits that agree"
                     " with each other are found only where a train episode that is played again shows them"
                 )
-            total = sum(len(indexes) * (1 + (policy and one.split == "train")) for one, indexes in chosen)
+            total = sum(len(indexes) * (1 + (one.split == "train")) for one, indexes in chosen)
             playing.update(total=total)
 
             async def play() -> None:
                 for played, indexes in chosen:
                     await verifier.replay(played, indexes)
-                    if policy and played.split == "train":
+                    if played.split == "train":
                         await verifier.play_policy(played, indexes)
                 await verifier.check_fingerprint()
 
-            tiers = {tier or finished.record.sandbox_tier}
-            await playing.play([finished.record.env], tiers, slots, play)
+            await playing.play([finished.record.env], {finished.record.sandbox_tier}, play)
         return verifier.report
 
     with fail_on_our_errors():

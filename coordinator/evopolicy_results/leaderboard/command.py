@@ -6,20 +6,19 @@ Exit codes: 0 written, 1 no file could be shown, 2 wrong usage.
 from __future__ import annotations
 
 import asyncio
-import random
 import re
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from evopolicy_common.cli.conventions import Json, fail, fail_on_our_errors
+from evopolicy_common.cli.conventions import fail, fail_on_our_errors
 from evopolicy_common.cli.frame import App
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.processes.preflight import check_writable
 from evopolicy_common.processes.scratch import scratch_folder
 from evopolicy_common.records.newest import described
-from evopolicy_common.terminal import one_line, say, say_json
+from evopolicy_common.terminal import one_line, say
 from evopolicy_results.publish.archive import Archive
 from evopolicy_results.publish.findings import Checked
 from evopolicy_results.publish.replay import replay as replayed
@@ -53,11 +52,6 @@ def leaderboard(
             help="Replay recorded actions of each file: `5%` of the episodes, drawn at random, or `all`.",
         ),
     ] = None,
-    slots: Annotated[
-        int, typer.Option(min=1, max=1024, help="With --replay: episodes at the same time.")
-    ] = 2,
-    title: Annotated[str, typer.Option(help="Heading of the site.")] = "Leaderboard",
-    as_json: Json = False,
 ) -> None:
     """Write a leaderboard of several labs' published results as a static site.
 
@@ -88,23 +82,17 @@ def leaderboard(
 
         def play(archive: Archive, checked: Checked) -> None:
             if share is not None:
-                drawn = random.SystemRandom().randrange(2**32)
-                asyncio.run(replayed(archive, checked, share, drawn, slots, lambda played, total: None))
+                asyncio.run(replayed(archive, checked, share, lambda played, total: None))
 
         try:
             bundles = read_bundles(files, labs, Path(folder), play)
         except OSError as error:
             raise ConfigError(f"{error.filename}: {error.strerror}") from error
         shown = [bundle for bundle in bundles if not bundle.refused]
-        index = write_site(bundles, out, title=title, tell=lambda text: say(one_line(text), err=True))
-    if as_json:
-        names = ("file", "signer", "lab", "runs", "refused")
-        told = [{name: getattr(one, name) for name in names} | {"runs": len(one.runs)} for one in bundles]
-        say_json({"index": str(index), "files": told})
-    else:
-        for one in bundles:
-            if one.refused:
-                say(one_line(f"not shown: {one.file}: {one.refused}"), err=True)
-        say(f"{len(shown)} of {len(bundles)} files: {index}")
+        index = write_site(bundles, out, tell=lambda text: say(one_line(text), err=True))
+    for one in bundles:
+        if one.refused:
+            say(one_line(f"not shown: {one.file}: {one.refused}"), err=True)
+    say(f"{len(shown)} of {len(bundles)} files: {index}")
     if not shown:
         raise typer.Exit(NOTHING)

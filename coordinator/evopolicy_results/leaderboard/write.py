@@ -49,7 +49,7 @@ Cell = str | int | float | Link
 
 
 def write_site(
-    bundles: Sequence[LabBundle], out: Path, *, title: str, tell: Tell = lambda text: None
+    bundles: Sequence[LabBundle], out: Path, *, title: str = "Leaderboard", tell: Tell = lambda text: None
 ) -> Path:
     """Writes the site and returns its `index.html`. Raises ConfigError when `out` holds anything else.
 
@@ -86,7 +86,7 @@ def _write_pages(bundles: Sequence[LabBundle], out: Path, title: str, tell: Tell
     runs: list[tuple[Cell, ...]] = []
     for number, board in enumerate(all_boards, start=1):
         tell(f"board {number} of {len(all_boards)}: {len(board.runs)} runs")
-        study = study_of(board.runs, allow_mixed=True, allow_unknown=True)
+        study = study_of(board.runs, allow_mixed=True)
         folder = f"board-{number}"
         write_report(study, out / folder, title=f"{title}, board {number}")
         entries |= set(study.entries)

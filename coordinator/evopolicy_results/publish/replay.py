@@ -61,9 +61,9 @@ PlayRun = Callable[[Evaluations, PublishedRun, Sequence[Chosen], bool], Awaitabl
 run's."""
 
 
-async def replay(files: Files, checked: Checked, share: float, seed: int, slots: int, tell: Tell) -> None:
-    """Plays a share of all recorded episodes, drawn by `seed`, and adds the findings to `checked`."""
-    chosen = draw(checked.runs, share, seed)
+async def replay(files: Files, checked: Checked, share: float, tell: Tell) -> None:
+    """Plays a share of all recorded episodes, drawn at random, and adds the findings to `checked`."""
+    chosen = draw(checked.runs, share)
     if not chosen:
         checked.add("replay", "open", "there are no episodes to play")
 
@@ -90,12 +90,12 @@ async def replay(files: Files, checked: Checked, share: float, seed: int, slots:
         # A replay shows nothing of episodes without a recording, however many it drew.
         missing = checked.unrecorded(name)
         if alike:
-            text = f"{played} episodes, bit for bit (drawn by seed {seed})"
+            text = f"{played} episodes, bit for bit (drawn at random)"
             if missing:
                 text += f"; only {', '.join(missing)} episodes have a recording"
             checked.add("replay", "open" if missing else "ok", text, name)
 
-    await play_runs("replay", chosen, checked, slots, tell, play_run)
+    await play_runs("replay", chosen, checked, tell, play_run)
 
 
 def _recorded(files: Files, part: Chosen) -> dict[int, bytes]:
@@ -136,18 +136,16 @@ async def play_policies(
     files: Files,
     checked: Checked,
     share: float,
-    seed: int,
-    slots: int,
     tell: Tell,
     packages: Collection[str] = (),
 ) -> None:
-    """Plays a share of the episodes of deterministic policies, drawn by `seed`, and adds the findings to `checked`.
+    """Plays a share of the episodes of deterministic policies, drawn at random, and adds the findings to `checked`.
 
     `packages`: those that policies may import besides numpy, where their run names it."""
     checked.findings = [each for each in checked.findings if each.kind != "policies"]
     declared: dict[tuple[str, int], Bundle] = {}
     chosen: list[Chosen] = []
-    drawn = draw(checked.runs, share, seed)
+    drawn = draw(checked.runs, share)
     for run in checked.runs:
         own = {
             (run.folder, index): bundle
@@ -209,7 +207,7 @@ async def play_policies(
             text = f"{same} episodes of policies that declare themselves deterministic: the same actions"
             checked.add("policies", "ok", text, name)
 
-    await play_runs("policies", chosen, checked, slots, tell, play_run, packages)
+    await play_runs("policies", chosen, checked, tell, play_run, packages)
 
 
 async def _difference(evaluations: Evaluations, recorded: Trajectory, outcome: EpisodeOutcome) -> str | None:
@@ -235,7 +233,6 @@ async def play_runs(
     kind: str,
     chosen: Sequence[Chosen],
     checked: Checked,
-    slots: int,
     tell: Tell,
     play_run: PlayRun,
     packages: Collection[str] | None = None,
@@ -272,7 +269,7 @@ async def play_runs(
 
     for (offered, _), runs in clusters.items():
         try:
-            async with _cluster_of(runs, slots, told, offered) as evaluations:
+            async with _cluster_of(runs, told, offered) as evaluations:
                 for run in runs:
                     why_not, other_cpu = await unplayable(evaluations, run)
                     if why_not:
@@ -291,12 +288,12 @@ def not_allowed(packages: Sequence[str]) -> str:
     return f"its policies import packages that this command does not allow; allow them with {options}"
 
 
-def draw(runs: Sequence[PublishedRun], share: float, seed: int) -> list[Chosen]:
+def draw(runs: Sequence[PublishedRun], share: float) -> list[Chosen]:
     """A share of all episodes of the runs, by group. Leaves out those whose cases cannot be."""
     groups = [(run, group) for run in runs for group in run.groups]
     sizes = [len(group.episodes) for _, group in groups]
     chosen = []
-    for k, drawn in sample(sizes, max(1, round(share * sum(sizes))), seed):
+    for k, drawn in sample(sizes, max(1, round(share * sum(sizes)))):
         run, group = groups[k]
         submit = next((one for one in run.result.submits if one.submit_index == group.submit_index), None)
         train = () if submit is None else submit.env_instances
@@ -318,7 +315,7 @@ def draw(runs: Sequence[PublishedRun], share: float, seed: int) -> list[Chosen]:
 
 @contextlib.asynccontextmanager
 async def _cluster_of(
-    runs: Sequence[PublishedRun], slots: int, tell: Callable[[int, str], None], packages: Sequence[str]
+    runs: Sequence[PublishedRun], tell: Callable[[int, str], None], packages: Sequence[str]
 ) -> AsyncIterator[Evaluations]:
     """A cluster whose splits are those of the runs. `packages`: those that policies may import besides numpy."""
     with scratch_folder("check-data") as data:
@@ -330,7 +327,7 @@ async def _cluster_of(
                 content = SplitFile(env=env, split=FILE_STEMS[split], cases=run.cases(split), secret=False)
                 (folder / f"{FILE_STEMS[split]}.json").write_bytes(msgspec.json.encode(content))
         async with local_cluster("check", data=Path(data), policy_packages=packages) as cluster:
-            await cluster.start_workers(sorted(by_env), slots=slots, tiers={"bwrap"})
+            await cluster.start_workers(sorted(by_env), tiers={"bwrap"})
             async with transport.connect(credentials.find("operator", (), cluster.operator_file)) as link:
                 yield Evaluations(link, tell, own=True)
 

@@ -70,7 +70,7 @@ def _named(mixtures: Sequence[Mixture]) -> Iterator[str]:
 
 
 UNKNOWN_ISOLATION = "hidden isolation, where some runs do not tell it,"
-"""Older runs without this record beside runs with it; their comparison needs an option of its own."""
+"""Runs without this record, such as those of the published software, beside runs with it."""
 
 
 class _Setting(NamedTuple):

@@ -17,7 +17,7 @@ from evopolicy_results.behaviour.edits import (
     edit_size_bins,
     structure_means,
 )
-from evopolicy_results.reading.comparability import UNKNOWN_ISOLATION, MixedRunsError, Mixture, mixtures
+from evopolicy_results.reading.comparability import MixedRunsError, Mixture, mixtures
 from evopolicy_results.reading.environments import (
     by_name,
     learn_names,
@@ -130,14 +130,13 @@ def study_of(
     *,
     left_out: Iterable[LeftOut] = (),
     allow_mixed: bool = False,
-    allow_unknown: bool = False,
     scores: ScoreTable | None = None,
     resamples: int = RESAMPLES,
 ) -> Study:
     """Computes every metric. Raises MixedRunsError when the runs are not one comparison and `allow_mixed` is false.
 
-    Only `allow_unknown` allows runs without a record of their hidden isolation beside runs with one. `scores` adds a
-    table of scores without run directories (such as the paper's), with other entries than those of the runs.
+    `scores` adds a table of scores without run directories (such as the paper's), with other entries than those of the
+    runs.
     """
     learn_names(run.record for run in runs)
     whole = [run for run in runs if run.record.start is None]
@@ -148,9 +147,8 @@ def study_of(
     if scores is not None:
         table, more = _merged(table, scores)
         mixed += more
-    refused = [one for one in mixed if not (allow_unknown if one.what == UNKNOWN_ISOLATION else allow_mixed)]
-    if refused:
-        raise MixedRunsError(refused)
+    if mixed and not allow_mixed:
+        raise MixedRunsError(mixed)
     every, ordered = _in_order(runs), _in_order(whole)
     random = {env: cell.mean for (entry, env), cell in table.cells.items() if entry == table.reference}
     curves = evolutions(ordered, {env: mean for env, mean in random.items() if mean is not None})
@@ -177,7 +175,6 @@ def study(
     paths: Iterable[Path | str],
     *,
     allow_mixed: bool = False,
-    allow_unknown: bool = False,
     jobs: int = 1,
     rescore: str = "",
 ) -> Study:
@@ -186,7 +183,7 @@ def study(
     with Processes(jobs) as processes:
         loaded = load_runs([Path(path) for path in paths], processes=processes)
     runs = rescored(loaded.runs, rescore) if rescore else loaded.runs
-    return study_of(runs, left_out=loaded.left_out, allow_mixed=allow_mixed, allow_unknown=allow_unknown)
+    return study_of(runs, left_out=loaded.left_out, allow_mixed=allow_mixed)
 
 
 def _suite(name: str, table: ScoreTable, runs: Sequence[Run], resamples: int) -> Suite:

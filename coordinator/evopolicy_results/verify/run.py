@@ -18,7 +18,7 @@ from typing import Any
 import msgspec
 
 from evopolicy_common.errors import BundleError, ConfigError
-from evopolicy_common.messages.episode import EpisodeOutcome, Tier
+from evopolicy_common.messages.episode import EpisodeOutcome
 from evopolicy_common.messages.gateway import CANCELLED
 from evopolicy_common.messages.operator import DescribeEnvironment, EnvironmentState
 from evopolicy_common.records.aggregates import mean
@@ -88,7 +88,7 @@ class _Recording(msgspec.Struct, kw_only=True):
 class Verifier:
     """One verification on one cluster."""
 
-    def __init__(self, evaluations: Evaluations, run: RunUnderTest, tier: Tier | None = None) -> None:
+    def __init__(self, evaluations: Evaluations, run: RunUnderTest) -> None:
         self._evaluations = evaluations
         self._run = run
         dimensions = run.record.experiment_dimensions
@@ -96,7 +96,7 @@ class Verifier:
             "env": run.record.env,
             "conditions": dimensions,
             "run": run.record.run,
-            "tier": tier or run.record.sandbox_tier,
+            "tier": run.record.sandbox_tier,
             "limits": dimensions.limits,
         }
         self._knows_run = False

@@ -104,7 +104,7 @@ def test_published_runs_and_ours_are_compared_only_where_that_is_allowed(tmp_pat
     result = CliRunner().invoke(app, [str(tmp_path / "runs"), "--out", str(tmp_path / "report")])
     assert result.exit_code != 0
     assert "policy scope" in result.output
-    tables = report(tmp_path, str(tmp_path / "runs"), "--allow-mixed", "--allow-unknown")
+    tables = report(tmp_path, str(tmp_path / "runs"), "--allow-mixed")
     assert {row["runs"] for row in tables["not_told"]["rows"]} == {1}
 
 
@@ -170,7 +170,7 @@ def test_runs_of_both_softwares_are_paired_by_the_cases_of_their_files(tmp_path:
     assert result.exit_code != 0
     assert "failed episodes" in result.output
     assert "split on" not in result.output
-    tables = report(tmp_path, str(tmp_path / "runs"), "--allow-mixed", "--allow-unknown")
+    tables = report(tmp_path, str(tmp_path / "runs"), "--allow-mixed")
     assert tables["left_out"]["rows"] == []
     names = {"model-a", "model-a (published software)"}
     (pair,) = (row for row in tables["pairs_core16"]["rows"] if {row["first"], row["second"]} == names)

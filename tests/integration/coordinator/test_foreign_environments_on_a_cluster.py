@@ -104,7 +104,7 @@ def test_an_environment_of_the_workers_alone_goes_from_announcement_to_report(
     assert by_digest.returncode == 0, by_digest.stderr
     approved = operator.says("envs", "approve", f"acme/glider@{digest}")
     assert approved.returncode == 0, approved.stderr
-    assert "Glider" in operator.says("envs", "--show", "acme/glider").stdout
+    assert "Glider" in operator.says("envs", "--env", "acme/glider").stdout
     run = operator.says(
         *("run", "--env", "acme/glider", "--agent", "evolve", "--budget", "6", "--exp-id", "a"),
         *("--validation", "2", "--heldout", "2", "--tier", "bwrap"),

@@ -110,6 +110,6 @@ def test_an_awaited_environment_is_described_and_kept_for_later_starts(cluster: 
     cluster.start()
     described, later = wait_until(lambda: found if env in (found := cluster.offered())[0] else None)
     assert (described, later) == (known, ids - known)
-    listed = next(each for each in cluster.says("envs", "--filter", env))
+    listed = next(each for each in cluster.says("envs", "--env", env))
     assert listed["accepted"] == "ships"
     assert listed["description"]["step_us"] > 0

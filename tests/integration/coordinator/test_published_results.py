@@ -363,7 +363,7 @@ def test_no_module_that_a_file_names_is_imported(
     settings = msgspec.structs.replace(run.opening.settings, env="evil_env:Glider-v0")
     opening = msgspec.structs.replace(run.opening, settings=settings)
     checked.runs = [msgspec.structs.replace(run, opening=opening)]
-    asyncio.run(replays.replay(Held(results.files), checked, 1.0, 0, 1, lambda n, total: None))
+    asyncio.run(replays.replay(Held(results.files), checked, 1.0, lambda n, total: None))
     texts = {each.text for each in checked.findings if each.kind == "replay"}
     assert texts == {"evil_env:Glider-v0 is not installed here"}
     assert not (tmp_path / "imported").exists()

@@ -123,16 +123,14 @@ def test_checkpoints_play_further_cases_and_the_report_uses_them(played: Played)
     assert [each.submit_index for each in added.checkpoints] == [0, 1]
     assert added.checkpoint(mine.selected) == mine.checkpoints[0]
 
-    done = evopolicy(
-        played.root, "report", "runs", "--scores", "cases-8", "--out", "report", "--jobs", "1", code=0
-    )
+    done = evopolicy(played.root, "report", "runs", "--scores", "cases-8", "--out", "report", code=0)
     document = json.loads((played.root / "report" / "report.json").read_text())
     assert "cases-8: 8 further hidden cases, played post hoc" in document["post_hoc"]
     assert "post hoc" in document["tables"]["heldout_toy"]["caption"]
     assert "post hoc" in (played.root / "report" / "index.html").read_text()
     shown = {run["entry"]: run["score"] for run in document["runs"]}
     assert shown["mine"] == math.fsum(mine.checkpoints[0].returns) / 8
-    plain = evopolicy(played.root, "report", "runs", "--out", "plain", "--jobs", "1")
+    plain = evopolicy(played.root, "report", "runs", "--out", "plain")
     assert plain.returncode == 0, plain.stderr
     own = json.loads((played.root / "plain" / "report.json").read_text())
     assert own["post_hoc"] == ""

@@ -92,20 +92,17 @@ async def test_worker_out_of_service_gets_no_work_until_it_is_taken_back(
             assert [job for job in worker.jobs if created.run in job.job_id]
 
 
-async def test_workers_and_runs_are_listed_and_unknown_workers_refused(coordinator: Coordinator) -> None:
-    async with operator_of(coordinator) as operator, working(coordinator, "w-listed"):
-        created = await operator.create("listed")
-        await worker_shown(operator, "w-listed")
-        for command, field, name in (("workers", "worker", "w-listed"), ("runs", "run", created.run)):
-            assert name in (await called(coordinator, command, "list")).stdout
-            listed = json.loads((await called(coordinator, command, "list", "--json")).stdout)
-            assert name in [one[field] for one in listed]
-        for command in ("pause", "drain", "resume"):
-            wrong = await called(coordinator, "workers", command, "nosuch")
-            assert wrong.exit_code == 2
-            assert "no worker 'nosuch' is connected; there are: " in wrong.stderr
-            assert "w-listed" in wrong.stderr
-            assert (await called(coordinator, "workers", command, "nosuch", "--absent")).exit_code == 0
+async def test_a_pause_of_an_absent_worker_holds_when_it_connects(
+    coordinator: Coordinator,
+) -> None:
+    async with operator_of(coordinator) as operator:
+        async with working(coordinator, "w-there"):
+            await worker_shown(operator, "w-there")
+            told = (await called(coordinator, "workers", "pause", "w-later")).stdout
+            assert told.startswith("w-later is not connected; it is paused when it connects. Connected: ")
+            assert "w-there" in told
+        async with working(coordinator, "w-later"):
+            assert (await worker_shown(operator, "w-later")).state == "paused"
 
 
 async def test_cancelled_run_is_finished_without_a_score(coordinator: Coordinator) -> None:

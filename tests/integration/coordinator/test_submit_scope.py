@@ -95,7 +95,7 @@ def test_the_scope_is_recorded_and_kept_out_of_a_comparison(played: Played, tmp_
     for scope, folder in played.runs.items():
         record = json.loads((folder / "run.json").read_text())
         assert record["experiment_dimensions"]["policy_scope"] == scope
-    out = words("--out report --no-pages --jobs 1")
+    out = words("--out report")
     done = evopolicy(tmp_path, "report", *map(str, played.runs.values()), *out, code=3)
     assert "policy scope" in done.stderr
     assert not (tmp_path / "report").exists()
@@ -112,9 +112,9 @@ def test_results_of_actions_are_verified_and_clocks_show_in_second_checks(played
 
 
 def test_a_sample_takes_whole_submits_of_policies_with_that_scope(played: Played) -> None:
-    report = played.verify("submit", "--sample", "6", "--seed", "3")
-    assert report["episodes"] == 6
-    assert report["policy_episodes"] == 0
-    assert [found["difference"] for found in report["not_checked"]] == [
-        "its one policy plays whole submits, of which this sample is a part"
-    ]
+    # 6 of the 10 episodes are hidden: the sample has 1 to 4 of the submit's 4.
+    report = played.verify("submit", "--sample", "7")
+    assert report["episodes"] == 7
+    part = "its one policy plays whole submits, of which this sample is a part"
+    not_checked = [found["difference"] for found in report["not_checked"]]
+    assert (report["policy_episodes"], not_checked) in [(0, [part]), (4, [])]

@@ -26,7 +26,6 @@ POLICY = "class Policy:\n  def __init__(self, *a): pass\n  def reset(self, i): p
 TIMEOUT_S = 120
 COMMANDS = {
     "try": f"{EVOPOLICY} try policy --env toy/line",
-    "run": f"{EVOPOLICY} run --local {PLAYED}",
     "local": f"{EVOPOLICY} local {PLAYED}",
     "suite": f"{EVOPOLICY} suite t.toml --local",
     "state": f"{EVOPOLICY} local {PLAYED} --runs /tmp/evopolicy-nowhere --state state",

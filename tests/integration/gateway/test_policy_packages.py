@@ -73,16 +73,14 @@ def test_policies_import_the_runs_packages_and_nothing_beside_them(record: RunRe
 
 
 def test_verify_plays_the_policies_with_their_packages(root: Path) -> None:
-    out, _ = ended(
-        root, "verify", str(run_dir(root)), "--local", "--state", "state", "--json", "--slots", "1"
-    )
+    out, _ = ended(root, "verify", str(run_dir(root)), "--local", "--state", "state", "--json")
     report = json.loads(out)
     assert (report["policy_episodes"], report["policy_differences"]) == (2, [])
     assert report["fingerprint_differences"] == []
 
 
 def test_a_rescore_plays_the_checkpoint_with_its_packages(root: Path) -> None:
-    ended(root, "rescore", "runs", "--cases", "2", "--local", "--state", "state", "--slots", "1")
+    ended(root, "rescore", "runs", "--cases", "2", "--local", "--state", "state")
     (played,) = json.loads((run_dir(root) / "rescore/cases-2.json").read_text())["checkpoints"]
     assert played.get("failures", {}) == {}
 
@@ -102,7 +100,7 @@ def test_published_policies_import_what_the_checker_allows_them_by_name(root: Pa
     ended(root, "publish", str(run_dir(root)), "--out", "results.evp", "--local", "--state", "state")
 
     def printed(*options: str) -> list[str]:
-        asked = ("check", "results.evp", "--policies", "all", "--json", "--slots", "1", *options)
+        asked = ("check", "results.evp", "--policies", "all", "--json", *options)
         out, _ = ended(root, *asked)
         return [each["text"] for each in json.loads(out)["findings"] if each["kind"] == "policies"]
 

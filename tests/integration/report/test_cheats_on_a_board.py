@@ -167,7 +167,7 @@ class Labs:
         """As the command reads the files of a board, with every episode played again."""
 
         def play(archive: Archive, checked: Checked) -> None:
-            asyncio.run(replay(archive, checked, 1.0, 0, 1, lambda played, total: None))
+            asyncio.run(replay(archive, checked, 1.0, lambda played, total: None))
 
         keys = {identity.public_key(self.root / lab): lab for lab in RUNS}
         files = [self.root / f"{entry}-{number}.evp" for entry in BOARDS[number]]

@@ -187,7 +187,7 @@ def test_held_out_recordings_follow_the_feedbacks_option_unless_they_have_their_
 
 
 def test_recorded_videos_play_in_a_browser_with_the_agents_side_by_side(runs: Path, tmp_path: Path) -> None:
-    arguments = [str(runs), "--out", str(tmp_path / "report"), "--jobs", "1", "--json"]
+    arguments = [str(runs), "--out", str(tmp_path / "report")]
     refused = CliRunner().invoke(app, arguments)
     assert "videos in feedback on toy/line" in refused.output
     invoked = CliRunner().invoke(app, [*arguments, "--allow-mixed"])
@@ -213,7 +213,7 @@ def test_recorded_videos_play_in_a_browser_with_the_agents_side_by_side(runs: Pa
 
 
 def test_report_says_which_recordings_there_are(runs: Path, tmp_path: Path) -> None:
-    arguments = [str(runs), "--out", str(tmp_path / "report"), "--no-pages", "--allow-mixed"]
+    arguments = [str(runs), "--out", str(tmp_path / "report"), "--allow-mixed"]
     result = CliRunner().invoke(app, arguments)
     assert result.exit_code == 0, result.output
     text = (tmp_path / "report/index.html").read_text()

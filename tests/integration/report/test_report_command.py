@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import os
 import re
 import subprocess
 import sys
@@ -61,7 +62,7 @@ def report_on(folder: Path, *options: str) -> Path:
 @pytest.fixture(scope="module")
 def report(runs: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("out") / "report"
-    found = json.loads(reported(runs, out, "--jobs", "1", "--json").stdout)
+    found = json.loads(reported(runs, out, "--json").stdout)
     assert (found["runs"], len(found["left_out"])) == (23, 1)
     assert found["index"] == str(out / "index.html")
     return out
@@ -217,11 +218,10 @@ def test_columns_without_any_value_are_not_on_the_page(report: Path) -> None:
 def test_evopolicy_has_report_as_a_plain_command(tmp_path: Path) -> None:
     write_run(tmp_path / "runs", PLAIN)
     command = [sys.executable, "-c", "from evopolicy_gateway.cli.main import main; main()", "report"]
-    arguments = [str(tmp_path / "runs"), "--out", str(tmp_path / "report"), "--no-pages"]
+    arguments = [str(tmp_path / "runs"), "--out", str(tmp_path / "report")]
     done = subprocess.run([*command, *arguments], capture_output=True, text=True, timeout=120, check=False)
     assert done.returncode == 0, done.stderr
     assert "1 run, 0 left out" in done.stdout
-    assert not (tmp_path / "report/traces").exists()
 
 
 def test_left_out_run_is_listed_with_its_reason(report: Path) -> None:
@@ -232,12 +232,15 @@ def test_left_out_run_is_listed_with_its_reason(report: Path) -> None:
 
 
 @pytest.mark.system
-def test_report_is_the_same_whether_one_or_two_processes_make_it(tmp_path: Path) -> None:
+def test_report_is_the_same_whether_one_or_two_processes_make_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     for folder in write_suite(tmp_path / "runs", environments=("gym/racing", "own/glider"), n_submits=4):
         amend(folder, {"env_title": "Glider"} if "glider" in str(folder) else {})
     written = []
     for jobs in ("1", "2"):
-        reported(tmp_path / "runs", tmp_path / jobs, "--jobs", jobs)
+        monkeypatch.setattr(os, "cpu_count", lambda jobs=jobs: int(jobs))
+        reported(tmp_path / "runs", tmp_path / jobs)
         files = [path for path in (tmp_path / jobs).rglob("*") if path.is_file()]
         written.append({path.relative_to(tmp_path / jobs): path.read_bytes() for path in files})
     assert written[0].keys() == written[1].keys()
@@ -265,16 +268,14 @@ def test_mixed_runs_are_refused_unless_told_and_then_marked(tmp_path: Path) -> N
     assert "policy scope on core16" in (report_on(tmp_path, "--allow-mixed") / "index.html").read_text()
 
 
-def test_runs_of_unknown_isolation_are_warned_of_and_mixed_by_name(tmp_path: Path) -> None:
+def test_runs_of_unknown_isolation_are_named_and_mixed_on_request(tmp_path: Path) -> None:
     runs, out = tmp_path / "runs", tmp_path / "report"
     write_run(runs, PLAIN, hidden_isolation="unknown")
-    alone = reported(runs, out).output
-    assert "warning: 1 of 1 runs do not tell whether hidden episodes and agents shared" in alone
+    reported(runs, out)
     assert "1 of 1 runs do not tell whether" in (out / "index.html").read_text()
     write_run(runs, PLAIN, entry="Other", hidden_isolation="exclusive")
-    refused = reported(runs, out, "--allow-mixed", code=3).output
-    assert "or --allow-unknown to compare them all the same" in refused
-    reported(runs, out, "--allow-unknown")
+    assert "hidden isolation" in reported(runs, out, code=3).output
+    reported(runs, out, "--allow-mixed")
 
 
 def test_nothing_to_report_writes_nothing_and_says_why(tmp_path: Path) -> None:

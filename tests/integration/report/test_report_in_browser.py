@@ -27,7 +27,7 @@ COLUMN = """(() => {
 def report(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("browser")
     write_suite(folder / "runs", environments=("gym/acrobot", "gym/racing", "gym/ant5"), n_submits=6)
-    result = CliRunner().invoke(app, [str(folder / "runs"), "--out", str(folder / "report"), "--jobs", "1"])
+    result = CliRunner().invoke(app, [str(folder / "runs"), "--out", str(folder / "report")])
     assert result.exit_code == 0, result.output
     return folder / "report"
 

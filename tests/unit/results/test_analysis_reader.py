@@ -358,21 +358,20 @@ def test_an_error_names_five_values_and_five_runs_of_each(tmp_path: Path) -> Non
     assert same.count(str(tmp_path)) == 5
 
 
-def test_runs_from_before_isolation_was_recorded_are_mixed_only_by_name(tmp_path: Path) -> None:
+def test_runs_without_a_record_of_isolation_are_mixed_only_on_request(tmp_path: Path) -> None:
     before: dict[str, Any] = {"hidden_isolation": ..., "experiment_dimensions": {"hidden_cases": ...}}
     write_run(tmp_path, VERSIONS)
     write_run(tmp_path, VERSIONS, entry="Agent B", change=before)
-    for refused in ({}, {"allow_mixed": True}):
-        with pytest.raises(MixedRunsError, match=UNKNOWN_ISOLATION):
-            study([tmp_path], **refused)
-    assert [mixture.values for mixture in study([tmp_path], allow_unknown=True).mixtures] == [
+    with pytest.raises(MixedRunsError, match=UNKNOWN_ISOLATION):
+        study([tmp_path])
+    assert [mixture.values for mixture in study([tmp_path], allow_mixed=True).mixtures] == [
         {"exclusive": 1, "unknown": 1}
     ]
     # One that was shared is no more comparable for it.
     write_run(tmp_path, VERSIONS, entry="Agent C", hidden_isolation="shared")
     with pytest.raises(MixedRunsError, match="hidden isolation on core16: exclusive"):
-        study([tmp_path], allow_unknown=True)
-    assert len(study([tmp_path], allow_unknown=True, allow_mixed=True).mixtures) == 2
+        study([tmp_path])
+    assert len(study([tmp_path], allow_mixed=True).mixtures) == 2
 
 
 @pytest.mark.parametrize(

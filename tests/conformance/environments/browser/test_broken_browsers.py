@@ -81,7 +81,7 @@ def test_an_error_names_the_program_what_it_did_and_the_remedy(
     with pytest.raises(WorkerError, match=told) as error:
         make(ENV)
     assert str(program) in str(error.value)
-    assert "--browser PATH" in str(error.value)
+    assert "EVOPOLICY_BROWSER" in str(error.value)
     assert not list(scratch.iterdir())
     assert not running_in(scratch)
 
@@ -92,18 +92,19 @@ def test_what_is_no_program_is_named_before_anything_starts(
 ) -> None:
     use(program, monkeypatch)
     assert program in missing(ENV)
-    assert "--browser PATH" in missing(ENV)
+    assert "EVOPOLICY_BROWSER" in missing(ENV)
     with pytest.raises(WorkerError, match=f"'{program}' is no program"):
         make(ENV)
 
 
 @pytest.mark.parametrize(
     ("program", "code", "told"),
-    [("/bin/true", 1, "/bin/true does not start as a browser"), ("/nonexistent", 2, "/nonexistent")],
+    [("/bin/true", 1, "/bin/true does not start as a browser"), ("/nonexistent", 1, "/nonexistent")],
 )
 def test_a_command_says_it_too(program: str, code: int, told: str) -> None:
-    command = [sys.executable, "-P", "-m", "evopolicy_worker.cli", "check-env", "--browser", program, ENV]
-    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=120)
+    command = [sys.executable, "-P", "-m", "evopolicy_worker.cli", "check-env", ENV]
+    known = os.environ | {BROWSER: program}
+    done = subprocess.run(command, env=known, capture_output=True, text=True, check=False, timeout=120)
     assert done.returncode == code, done.stderr
     assert told in done.stdout + done.stderr
 

@@ -287,8 +287,8 @@ def test_without_a_browser_the_message_tells_what_to_do(monkeypatch: pytest.Monk
     monkeypatch.setattr(chromium, "_PROGRAMS", ())
     monkeypatch.setenv("PATH", "/nowhere")
     try:
-        assert "--browser" in missing("miniwob/click-test-v1")
-        with pytest.raises(WorkerError, match=r"needs .*Chromium.*--browser PATH"):
+        assert BROWSER in missing("miniwob/click-test-v1")
+        with pytest.raises(WorkerError, match=r"needs .*Chromium.*EVOPOLICY_BROWSER"):
             make("miniwob/click-test-v1")
         monkeypatch.setenv(BROWSER, "/etc/passwd")
         assert "/etc/passwd" in missing("miniwob/click-test-v1")

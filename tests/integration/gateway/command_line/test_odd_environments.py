@@ -42,7 +42,7 @@ def does(what: str, says: str, *options: str, code: int = 1) -> Row:
     return Row(says, file=f'kwargs = {{ does = "{what}" }}', options=options, code=code)
 
 
-SLOW = {"--env-timeout": "3", "--env-memory": "512"}
+SLOW = {"env_timeout": "3", "env_memory": "512"}
 TABLE = {
     "crash": does(
         "crash", rf"step 11: it raised ValueError: fell off the table; .*{SOURCE}crash_in_step_12: raise"
@@ -53,13 +53,13 @@ TABLE = {
         env="broken_import:X-v0",
     ),
     "hang in reset": does(
-        "hang in reset", "reset: it has not returned for 3 s.*--env-timeout", "--env-timeout", "3"
+        "hang in reset", "reset: it has not returned for 3 s.*--env-timeout", "--set", "env_timeout=3"
     ),
     "hang in step": does(
-        "hang in step", "step 0: it has not returned for 3 s.*--env-timeout", "--env-timeout", "3"
+        "hang in step", "step 0: it has not returned for 3 s.*--env-timeout", "--set", "env_timeout=3"
     ),
     "memory": does(
-        "grow", r"\d MiB of memory, and 512 MiB are the limit.*--env-memory", "--env-memory", "512"
+        "grow", r"\d MiB of memory, and 512 MiB are the limit.*--env-memory", "--set", "env_memory=512"
     ),
     "threads": does("threads", PLAYED, code=0),
     "own files": does("write a file", PLAYED, code=0),

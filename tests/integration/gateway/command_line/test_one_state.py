@@ -71,10 +71,10 @@ def test_a_users_runs_share_cases_until_one_without_a_jail(tmp_path: Path) -> No
     assert before == played(tmp_path, "b")[0]
     # The first run's worker has ended, and nobody waits for it.
     assert len(kernels(state)) == 1
-    ended(tmp_path, "report", "runs", "--out", "report", "--no-pages")
+    ended(tmp_path, "report", "runs", "--out", "report")
     fresh, _ = played(tmp_path, "c", "--fresh")
     assert fresh["heldout"] != before["heldout"]
-    assert "--fresh" in ended(tmp_path, "report", "runs", "--out", "report", "--no-pages", ends=3)[1]
+    assert "--fresh" in ended(tmp_path, "report", "runs", "--out", "report", ends=3)[1]
     steals = agent(tmp_path, f"STATE = {str(state)!r}\n" + STEAL)
     words = [
         "local",
@@ -135,16 +135,5 @@ def test_a_second_command_beside_the_first_is_told_what_to_do(tmp_path: Path) ->
 def test_state_and_fresh_do_not_go_together(tmp_path: Path) -> None:
     words = ("try", STILL, "--env", "toy/line", "--fresh", "--state", "x")
     assert "give only one of them" in ended(tmp_path, *words, ends=2)[1]
-    words = ("run", "--env", "toy/line", "--agent", "random", "--fresh")
-    assert "apply only with --local" in ended(tmp_path, *words, ends=2)[1]
-
-
-def test_a_browser_is_that_of_a_cluster_that_the_command_brings_up(tmp_path: Path) -> None:
-    browser = ("--browser", "/bin/true")
-    for words in (
-        ("try", STILL, "--env", "toy/line", "--credentials", "x"),
-        ("run", "--env", "toy/line", "--agent", "random"),
-    ):
-        assert "give it to each evopolicy-worker" in ended(tmp_path, *words, *browser, ends=2)[1]
-    words = ("try", "examples", "--env", "toy/line", "--credentials", "x", "--env-timeout", "5")
-    assert "give them to each evopolicy-worker" in ended(tmp_path, *words, ends=2)[1]
+    words = ("try", "examples", "--env", "toy/line", "--credentials", "x", "--set", "env_timeout=5")
+    assert "to each evopolicy-worker" in ended(tmp_path, *words, ends=2)[1]

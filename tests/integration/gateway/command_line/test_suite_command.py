@@ -435,6 +435,6 @@ def test_a_killed_sweep_leaves_no_open_run(
     assert entry["state"] == "completed"
     # Nothing was played before: a run that the coordinator alone knew is gone on with.
     assert entry["attempt"] == (1 if at == "created" and not changed else 2)
-    with command(tmp_path, "runs", "list", "--json", *given) as listed:
+    with command(tmp_path, "status", "--json", *given) as listed:
         assert listed.wait() == 0, listed.text
-        assert json.loads(listed.out) == []
+        assert json.loads(listed.out)["runs"] == []

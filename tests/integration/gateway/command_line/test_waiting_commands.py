@@ -53,7 +53,6 @@ def test_a_command_without_bubblewrap_names_the_remedy(tmp_path: Path, policy: s
     arguments = {
         "try": ["try", policy, "--env", "toy/line"],
         "local": ["local", *played],
-        "run": ["run", "--local", *played],
         "suite": ["suite", "t.toml", "--local"],
     }[name]
     with command(tmp_path, *arguments) as running:

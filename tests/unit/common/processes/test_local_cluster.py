@@ -202,13 +202,13 @@ async def started(state: Path | None, env_ids: Sequence[str], slots: int, **more
 async def test_a_local_cluster_passes_its_options_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     noted_by = noted(monkeypatch)
     monkeypatch.chdir(tmp_path)
-    more = {"browser": Path("/opt/chrome"), "env_timeout": 2.5, "env_memory": 512}
+    more = {"env_timeout": 2.5, "env_memory": 512}
     given = {"data": Path("d"), "policy_packages": ["scipy"], **more}
     await started(None, ["toy/line", "toy/maze"], 5, **given)
     expected = f"--trust-workers --data {tmp_path}/d --policy-package scipy"
     assert " ".join(noted_by["test-coordinator"]).endswith(expected)
     own = " ".join(noted_by["test-worker"])
-    assert "--policy-package scipy --browser /opt/chrome --env-timeout 2.5 --env-memory 512" in own
+    assert "--policy-package scipy --env-timeout 2.5 --env-memory 512" in own
     assert own.endswith("--env toy/line --env toy/maze --slots 5")
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import json
 from collections.abc import Callable
 from pathlib import Path
 
@@ -78,23 +77,20 @@ def test_list_tells_names_roles_expiry_and_revocation_and_no_secret(
     certs_cli.issue("operator", "boss", state=state)
     certs_cli.revoke("gpu-7", state=state)
     capsys.readouterr()
-    certs_cli.list_(state=state, as_json=True)
+    certs_cli.list_(state=state)
     text = capsys.readouterr().out
-    document = json.loads(text)
-    assert document["coordinator"]["hosts"][0] == "lab.example"
-    assert [(one["identity"], one["revoked"] is not None) for one in document["machines"]] == [
-        ("gateway/boss", False),
-        ("operator/boss", False),
-        ("worker/gpu-7", True),
+    rows = [line.split() for line in text.splitlines()]
+    assert [row[:2] for row in rows if {"gateway", "operator", "worker"} & {*row}] == [
+        ["boss", "gateway"],
+        ["boss", "operator"],
+        ["gpu-7", "worker"],
     ]
-    assert all(one["expires"] for one in document["machines"])
+    assert [row[0] for row in rows if "revoked" in row] == ["gpu-7"]
+    assert text.count("days left") == 3
+    assert "lab.example" in text
     for machine in Machines(state).all():
         assert machine.password not in text
         assert not machine.token or machine.token not in text
-    certs_cli.list_(state=state)
-    table = capsys.readouterr().out
-    assert "revoked" in table
-    assert "days left" in table
 
 
 @pytest.mark.parametrize(

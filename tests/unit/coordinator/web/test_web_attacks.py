@@ -237,12 +237,11 @@ async def test_unfinished_handshakes_keep_nobody_out(tmp_path: Path, few_descrip
     now = dt.datetime.now(dt.UTC)
     authority = certs.make_authority("lab", now)
     made = certs.issue(authority, "coordinator/lab", now, 1, hosts=["127.0.0.1"], serves=True)
-    certificate, key = tmp_path / "certificate.pem", tmp_path / "key.pem"
-    certificate.write_bytes(made.certificate)
-    key.write_bytes(made.private_key)
+    certificate = tmp_path / "certificate.pem"
+    certificate.write_bytes(made.certificate + made.private_key)
 
     async with (
-        served_view(tmp_path, certificate=certificate, private_key=key) as (host, port),
+        served_view(tmp_path, certificate=certificate) as (host, port),
         held_open(host, port, b"", 1200),
         httpx.AsyncClient(timeout=60, verify=False) as browser,
     ):

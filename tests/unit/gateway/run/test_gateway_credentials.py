@@ -51,24 +51,14 @@ def run(tmp_path: Path) -> RunFolder:
 
 
 def test_a_gateway_speaks_with_its_runs_credentials(run: RunFolder) -> None:
-    assert gateway._load(run, (), None) == (RUNS_OWN, OpenedRun(run="r-1"))
-
-
-def test_elsewhere_it_has_that_machines_rights_and_its_runs_capability(
-    run: RunFolder, tmp_path: Path
-) -> None:
-    loaded, opened = gateway._load(run, (), machines_folder(tmp_path / "m"))
-    assert (loaded.user, loaded.token, loaded.endpoints, opened.run) == (
-        "gateway/m",
-        "capability",
-        ("tls/lab:7447",),
-        "r-1",
-    )
+    assert gateway._load(run) == (RUNS_OWN, OpenedRun(run="r-1"))
 
 
 def test_a_runs_secrets_do_not_cross_a_network_in_the_clear(run: RunFolder) -> None:
+    there = msgspec.structs.replace(RUNS_OWN, endpoints=("tcp/10.0.0.5:7447",))
+    credentials.write(there, run.credentials)
     with pytest.raises(ConfigError, match="unencrypted"):
-        gateway._load(run, ("tcp/10.0.0.5:7447",), None)
+        gateway._load(run)
 
 
 @pytest.mark.parametrize("named", ["m", "m/operator.json"])

@@ -48,7 +48,7 @@ _DATA_LIMIT = 4 << 30
 """Bytes of writable memory of each of its processes, which the kernel enforces."""
 START_S = 60.0
 """How long a browser may take to answer first, seconds."""
-REMEDY = "name the program of a Chromium that works with --browser PATH"
+REMEDY = "name the program of a Chromium that works in the variable EVOPOLICY_BROWSER"
 _END_S = 10.0
 """How long its killed processes may take to end before the profile is removed all the same, seconds."""
 _POLL_S = 0.005
@@ -105,7 +105,7 @@ def program() -> str:
     for path in (*_PROGRAMS, *filter(None, map(shutil.which, _NAMES))):
         if os.access(path, os.X_OK):
             return path
-    raise WorkerError(f"Chromium: {distribution.install('chromium')}, or name one with --browser PATH")
+    raise WorkerError(f"Chromium: {distribution.install('chromium')}, or name one in EVOPOLICY_BROWSER")
 
 
 def lacking() -> str:

@@ -7,7 +7,6 @@ missing variables in a process that was started otherwise (tests, `evopolicy try
 from __future__ import annotations
 
 import os
-from pathlib import Path
 
 _ALWAYS = {
     # One slot has one core; and the order of summation in a threaded BLAS depends on the number of threads.
@@ -47,12 +46,6 @@ def process_environment(*, render: bool = False, accelerations: bool | None = No
         variables["MUJOCO_GL"] = "egl"
         variables["PYOPENGL_PLATFORM"] = "egl"
     return variables
-
-
-def use_browser(program: Path | None) -> None:
-    """Makes it the browser of this process and of those it starts; None leaves it as it is."""
-    if program is not None:
-        os.environ[BROWSER] = str(program.absolute())
 
 
 def accelerations_on() -> bool:
