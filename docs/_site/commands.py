@@ -24,7 +24,6 @@ OF_A_RUN = {
     *(one.flag for each in (RunOptions, JailSettings, ListenerOptions) for one in declared(each).values()),
 }
 """Options that `options.md` describes."""
-TABLE = "| option | meaning |\n|---|---|"
 
 
 def page() -> str:
@@ -42,7 +41,6 @@ def page() -> str:
     parts = [
         "# Commands\n\nEvery command has `--help` with an example. `evopolicy run`, `local`, and `suite` also have the"
         " [options of a run](options.md). Several commands share these options:\n",
-        TABLE,
         *sorted(shared),
         "",
     ]
@@ -50,7 +48,7 @@ def page() -> str:
         parts += [f"{'#' * depth} {name}\n", _text(command.help or "") + "\n"]
         options = [each for each in _options(command) if not _of_a_run(command, each)]
         if own := [_row(each) for each in options if _row(each) not in shared]:
-            parts += [TABLE, *own, ""]
+            parts += [*own, ""]
         if also := [f"`{each.opts[0]}`" for each in options if _row(each) in shared]:
             parts.append(f"Also {', '.join(also)}.\n")
         if of_a_run := [f"`{each.opts[0]}`" for each in _options(command) if _of_a_run(command, each)]:
@@ -73,14 +71,14 @@ def _of_a_run(command: Any, option: Any) -> bool:
 
 
 def _row(option: Any) -> str:
-    return f"| {_names(option)} | {_cell(option)} |"
+    return f"- {_names(option)}: {_meaning(option)}"
 
 
 def _names(option: Any) -> str:
     if option.param_type_name == "argument":
         return f"`{option.name.upper()}`"
     names = ", ".join(f"`{one}`" for one in [*option.opts, *option.secondary_opts])
-    return f"{names} {_cell_text('|'.join(_choices(option.type_descriptor.annotation)))}".rstrip()
+    return f"{names} {_plain('|'.join(_choices(option.type_descriptor.annotation)))}".rstrip()
 
 
 def _choices(annotation: Any) -> list[str]:
@@ -91,16 +89,16 @@ def _choices(annotation: Any) -> list[str]:
     return [one for part in get_args(annotation) for one in _choices(part)]
 
 
-def _cell(option: Any) -> str:
+def _meaning(option: Any) -> str:
     text, default = " ".join((getattr(option, "help", None) or "").split()), option.default
     shown = getattr(option, "show_default", False) and not callable(default)
     if shown and default not in (None, False, (), []):
         text += f" Default: {default}."
-    return _cell_text(text)
+    return _plain(text)
 
 
-def _cell_text(text: str) -> str:
-    return text.replace("<", "&lt;").replace(">", "&gt;").replace("|", "&#124;")
+def _plain(text: str) -> str:
+    return text.replace("<", "&lt;").replace(">", "&gt;")
 
 
 def _text(text: str) -> str:

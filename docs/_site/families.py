@@ -64,7 +64,7 @@ about {newest["profiles"]} environment profiles in {newest["ecosystems"]} ecosys
 only on seed and actions. *Played*: ids that `check-env` has played.
 {CPU}
 
-The newest version of the original also has, and we do not offer:
+evopolicy lacks these environments of that version:
 
 {lacking}"""  # noqa: E501
 

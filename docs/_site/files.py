@@ -52,20 +52,18 @@ def _struct(struct: type[msgspec.Struct], described: dict[str, Any], *, first: b
     named = [f"`{name}`" for name in fields if struct in (RunTable, JailSettings) and name in OF_A_RUN]
     if named:
         yield f"[Options of a run](options.md) describes {', '.join(named)}.\n"
-    rows = [(name, one) for name, one in fields.items() if f"`{name}`" not in named]
-    if rows:
-        yield "| field | type | meaning |\n|---|---|---|"
-        for name, one in rows:
+    for name, one in fields.items():
+        if f"`{name}`" not in named:
             default = None if name in needed else one.get("default")
-            text, value = one.get("description", ""), msgspec.json.encode(default).decode()
-            if default and len(value) < 40:
-                text = f"{text} Default: `{value}`.".strip()
-            yield f"| `{name}`{'' if name in needed else '?'} | {_cell(_type_text(one))} | {_cell(text)} |"
-        yield ""
+            value = msgspec.json.encode(default).decode()
+            text = f": {one['description']}" if "description" in one else ""
+            text += f" Default: `{value}`." if default and len(value) < 40 else ""
+            yield _line(f"- `{name}`{'' if name in needed else '?'} ({_type_text(one)}){text}")
+    yield ""
 
 
-def _cell(text: str) -> str:
-    return text.replace("|", "&#124;").replace("<", "&lt;").replace(">", "&gt;")
+def _line(text: str) -> str:
+    return text.replace("<", "&lt;").replace(">", "&gt;")
 
 
 def _type_text(described: dict[str, Any]) -> str:
