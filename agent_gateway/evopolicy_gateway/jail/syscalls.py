@@ -34,7 +34,9 @@ from evopolicy_common.seccomp import (
 )
 from evopolicy_common.seccomp.numbers import ATTRIBUTES, MODES, REFUSED, SET_AFFINITY, SOCKET
 
-GIVE_UP = "or give the jail up by name with --jail none of `evopolicy run` or `local`, which run.json then says"
+GIVE_UP = (
+    "or give the jail up by name with --jail none of `evopolicy run` or `local`, which run.json then says"
+)
 _REFUSED = {
     # ENOSYS as from a kernel without these calls, which programs can handle.
     errno.ENOSYS: ("io_uring_setup", "add_key", "request_key", "keyctl"),

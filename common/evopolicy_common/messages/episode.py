@@ -63,14 +63,13 @@ class ResourceLimits(msgspec.Struct, frozen=True, kw_only=True):
     output_bytes: Int = 64 << 10
     """Bytes kept of each of stdout and stderr of an episode."""
     action_bytes: Int = 16 << 10
-    """Size of one action beyond 16 bytes for each number or character of the action space, bytes. The action may
-    consist of at most one value for every 16 bytes of the whole."""
+    """Size of one action, bytes, plus 16 bytes for each number or character of the action space. It may have one value
+    for every 16 bytes."""
     episode_action_bytes: Int = 4 << 20
     """Size of an episode's actions together beyond what the action space needs, bytes."""
     feedback_bytes: Int = 16 << 30
-    """Size of the files of all the run's episodes together, bytes. Each episode has an equal share, whatever others
-    use, so that the files do not depend on which episode finished first. An episode beyond its share loses its video
-    first, then its observations, then its rows."""
+    """Size of the files of all the run's episodes together, bytes. Each episode has an equal share. Beyond it, an
+    episode loses its video, then its observations, then its rows."""
     submit_wall_s: Number | None = None
     """Wall time of a whole submit, seconds; None for no limit."""
 

@@ -78,8 +78,7 @@ class Start(msgspec.Struct, frozen=True, kw_only=True):
     parent_scored: bool = False
     """Set by the coordinator: the earlier agent had ended, so that a result may have chosen the place."""
     line: Line = Line()
-    """Set by the coordinator: the weakest conditions of the runs before. `unknown` while one of their agents is alive:
-    jail and metering are told when a run closes."""
+    """The weakest conditions of the runs before, from the coordinator. `unknown` while one of their agents is alive."""
 
     @property
     def text(self) -> str:

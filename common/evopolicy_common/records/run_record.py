@@ -74,8 +74,8 @@ class ModelUse(msgspec.Struct, frozen=True, kw_only=True):
     """How the agent used its model, besides `tokens`."""
 
     metering: Literal["relay", "agent"]
-    """`relay`: every request of the run was counted at the wire, and the agent did not have the key. `agent`: `tokens`
-    are the agent's own count, and `requests` and what follows are unknown."""
+    """`relay`: the relay counted every request and had the key. `agent`: the agent's own count of tokens; the following
+    fields are unknown."""
     limits: ModelLimits | None = None
     """None: this software sets none."""
     requests: int | None = None
@@ -83,7 +83,7 @@ class ModelUse(msgspec.Struct, frozen=True, kw_only=True):
     requests_failed: int = 0
     """Of these, requests without a whole answer."""
     requests_estimated: int = 0
-    """Requests of which a count is estimated: the answer broke off, or told no count that can be."""
+    """Requests with an estimated count: the answer broke off, or stated no valid count."""
     models: dict[str, int] = {}
     """Requests by the model that the answer names."""
     other_models: dict[str, int] = {}
@@ -99,7 +99,7 @@ class ModelUse(msgspec.Struct, frozen=True, kw_only=True):
     record_stopped: str = ""
     """Why the record ends before the run; empty where it does not."""
     reported: Tokens | None = None
-    """The agent's own count, beside that of the relay."""
+    """The agent's own count, in addition to the relay's."""
 
     def difference(self, tokens: Tokens | None) -> float | None:
         """How far the agent's own count is from `tokens`, as a share of these; None where one is unknown."""
@@ -109,7 +109,7 @@ class ModelUse(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class AgentLimits(msgspec.Struct, frozen=True, kw_only=True):
-    """What an agent may take of its machine. None: unlimited."""
+    """Limits of an agent's use of its machine. None: unlimited."""
 
     cpus: float | None = None
     """Processor time in cores."""
@@ -219,8 +219,8 @@ class ExperimentDimensions(msgspec.Struct, frozen=True, kw_only=True):
     step_limit: StepLimit = "natural"
     """Step limit: the published software's, or the environment's own, as in runs from before this field."""
     failed_episodes: FailedEpisodes = "play-on"
-    """Whether random actions play an episode on in which the policy failed (`play-on`), or it ends, and the submit has
-    no mean return and its checkpoint is not eligible (`end-submit`)."""
+    """After a failure of the policy, random actions play the episode (`play-on`), or the submit has no mean return and
+    its checkpoint is not eligible (`end-submit`)."""
     hidden_evaluation: HiddenEvaluation = "submit"
     """Arguments of a policy on hidden cases: those of its own submit, or those of one list of all cases (`pool`)."""
     profile: Profile = "own"
@@ -301,8 +301,8 @@ class Outcome(msgspec.Struct, frozen=True, kw_only=True):
     """Whether each of these episodes solved the task, as the environment reports it; empty where it reports nothing."""
     policy_failures: tuple[PolicyFailureRecord, ...] = ()
     quarantined_submits: tuple[int, ...] = ()
-    """`ok` checkpoints that are not eligible: their policy failed in validation with `failed_episodes` = "end-submit",
-    or, in runs of earlier versions, made its slot fail there."""
+    """`ok` checkpoints that are not eligible: with `failed_episodes` = "end-submit", their policy failed in
+    validation."""
     random_reference: ReferenceScore | None = None
     closed_reason: str = ""
     """`budget_spent`, `agent_stopped`, `agent_failed`, `silent`, `wall_limit`, `model_budget_spent`,
@@ -390,9 +390,8 @@ class Versions(msgspec.Struct, frozen=True, kw_only=True):
     fingerprint: dict[str, str] = {}
     """Library to version, as reported by the workers with which the run started."""
     installations: tuple[str, ...] = ()
-    """Python installations of the workers that played the run's episodes, in the order of their first ones:
-    `NAME@DIGEST`, with the families for which `evopolicy-worker setup` made it, or `base`, and 12 hex digits of a
-    SHA-256 over the names and versions of its packages. Empty in older files."""
+    """Installations that played the run's episodes, as `NAME@DIGEST`: the families of `evopolicy-worker setup`, or
+    `base`, and 12 hex digits of a SHA-256 over its packages."""
     fingerprint_overrides: tuple[str, ...] = ()
     """`CLASS → CLASS: why` for each time an operator let the run continue with other versions; empty with one class."""
     data_secret: bool = True
@@ -436,8 +435,8 @@ class RunRecord(msgspec.Struct, frozen=True, kw_only=True):
     jail: str
     """How the agent was confined: `bwrap`, `bwrap, open network` or `none`."""
     hidden_isolation: HiddenIsolation = "unknown"
-    """Whether hidden episodes and agents could share a kernel. `exclusive`: never. `shared`: possible. `waived`: the
-    operator vouched for where the agent was. `unknown`: the run is from before this was recorded."""
+    """Whether hidden episodes and agents could share a kernel: never (`exclusive`), possibly (`shared`), or the
+    operator vouched for the agent's place (`waived`). `unknown`: not recorded."""
     experiment_dimensions: ExperimentDimensions
     timing: Timing
     outcome: Outcome

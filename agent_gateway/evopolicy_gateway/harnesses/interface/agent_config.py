@@ -93,8 +93,8 @@ class AcpTable(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     auth: str = ""
     """Id of the login method to choose, where the agent wants one."""
     mode: str = ""
-    """Id of the session mode to choose. Empty: the agent's own, or `default` where that is `auto`: then the rules of
-    the run decide what the agent may do, and no model of the agent's."""
+    """Id of the session mode. Empty: the agent's own, or `default` in place of `auto`, in which a model of the agent's
+    decides about actions."""
     counts: Literal["turn", "session"] = "turn"
     """Whether the tokens that end a turn are those of the turn, or of the session so far."""
 
@@ -103,7 +103,7 @@ class ApiTable(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     """The model's API, to which the relay passes requests on."""
 
     provider: ProviderName | None = None
-    """Chooses base URL, API and the variable with the key. None: a server of your own at `base_url`."""
+    """Chooses base URL, API and the variable with the key. None: a server at `base_url`."""
     api: ApiName | None = None
     """OpenAI's Responses or Chat Completions, Anthropic's Messages, or Gemini's generateContent. None: the one of the
     provider, and `chat` without one."""
@@ -227,8 +227,8 @@ class AgentConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     provider: str | None = None
     """Provider whose outage or quota pauses this agent; None: the harness's usual one."""
     user_config: bool | tuple[str, ...] = False
-    """Gives the CLI the user's own settings, rules, memory and login, as a copy for the run; off, so that a run depends
-    on this file alone. Paths in `~/` name the files to copy for a CLI whose places evopolicy does not know."""
+    """Gives the CLI a copy of the user's settings, rules, memory and login. Paths in `~/` name the files of a CLI whose
+    places evopolicy does not know."""
     retries: int = 5
     """Most retries in a row, for one turn."""
     backoff_s: float = 4.0
