@@ -111,7 +111,7 @@ class Recorder:
             yield
         except (OSError, ValueError, ConfigError) as error:
             self._on = False
-            self._note(f"the record of model calls stops here, and the run goes on: {error}")
+            self._note(f"the record of model calls stops here, and the run continues: {error}")
             with contextlib.suppress(OSError):
                 # `run.json` has this text, which is published: no paths.
                 why = str(error) if isinstance(error, ValueError) else getattr(error, "strerror", None)

@@ -95,7 +95,7 @@ def test_a_flood_ends_the_record_and_not_the_run(
     served = recorded(tmp_path, [], act)
     folder = tmp_path / "model"
     assert served.used.requests == 30
-    assert len([note for note in served.notes if "stops here, and the run goes on" in note]) == 1
+    assert len([note for note in served.notes if "stops here, and the run continues" in note]) == 1
     assert 0 < len(read_calls(folder)) < 30
     assert (folder / "content.pack").stat().st_size < 200_000
     assert "limit" in (folder / "stopped").read_text() or "longer" in (folder / "stopped").read_text()
