@@ -22,7 +22,7 @@ from evopolicy_common.terminal import say_lines
 from evopolicy_gateway.relay.usage import tokens_in
 from evopolicy_gateway.run.plan import Plan
 
-_NO_RUN = "its agent failed before its first submit; its logs/agent.jsonl and logs/harness.log have the reason"
+_NO_RUN = "its agent failed before its first submit; logs/agent.jsonl and logs/harness.log have the reason"
 
 
 def load(root: Path, suite: str) -> Index:
