@@ -3,6 +3,7 @@
 # make test   installs, then runs the tests of every layer, but for:
 # make test-system  those that play many whole runs on clusters of their own
 # make test-families  those that play every family of environments
+# make test-cluster  those on a PostgreSQL server, which it installs (as root, on Debian) and starts by itself
 # make test-long  both at once, which takes less time than one after the other
 # make test-root  as root, those of `make test` that need root or say something else there: sandbox, jail, attacks
 # make paper-worker  installs a worker with the paper's library versions into .venv-paper
@@ -35,7 +36,7 @@ FAMILIES := $(VENV)/.families
 STAMP := $(VENV)/.installed
 
 .DEFAULT_GOAL := help
-.PHONY: help install families paper-worker demo test test-root test-system test-families test-long check check-envs docs release bench bench-start bench-replay bench-peers bench-against bench-throughput bench-scale bench-channels bench-coverage bench-isolation bench-costs faults sim clean
+.PHONY: help install families paper-worker demo test test-root test-system test-families test-long test-cluster check check-envs docs release bench bench-start bench-replay bench-peers bench-against bench-throughput bench-scale bench-channels bench-coverage bench-isolation bench-costs faults sim clean
 
 help:
 	@sed -n 's/^# make/make/p' Makefile
@@ -79,11 +80,12 @@ demo: $(CORE)
 PROCESSES := $$(( $$(nproc) + 9 ))
 
 # ARGS that name files play those, of whatever layer.
-test: LAYERS = not system and not families
-test-root: LAYERS = (root or walls) and not system and not families
+test: LAYERS = not system and not families and not cluster
+test-root: LAYERS = (root or walls) and not system and not families and not cluster
 test-system: LAYERS = system
 test-families: LAYERS = families
 test-long: LAYERS = system or families
+test-cluster: LAYERS = cluster
 # Here every test starts clusters of its own.
 test-system test-long: PROCESSES = $$(( $$(nproc) + 4 ))
 # These compute most of the time, and have limits on time; browsers and clusters wait.
@@ -92,9 +94,11 @@ test test-root: HOST = --tests
 # What killed commands leave there goes with the folder of the tests.
 test test-root: TEMPORARY = TMPDIR="$$short"
 test-system test-families test-long: HOST = --all-tests
+test-cluster: HOST = --cluster
+test-cluster: PROCESSES = 0
 # The tests start hundreds of processes: none of them shall compile our modules anew, whatever the shell asks of Python.
-test test-root test-system test-families test-long: export PYTHONDONTWRITEBYTECODE :=
-test test-root test-system test-families test-long: install
+test test-root test-system test-families test-long test-cluster: export PYTHONDONTWRITEBYTECODE :=
+test test-root test-system test-families test-long test-cluster: install
 	@bash deploy/setup-host.sh $(HOST)
 	@short="$$(mktemp -d /tmp/evp-XXXXXX)"; chmod 711 "$$short"; $(TEMPORARY) $(BIN)/python -m pytest --processes $(PROCESSES) --basetemp="$$short/t" \
 	$(if $(findstring tests/,$(ARGS)),,-m "$(LAYERS)") $(ARGS); status=$$?; \

@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
 # Installs the system packages that evopolicy needs: bubblewrap, the sandbox of policies and agents; with --tests, also those of `make test`;
-# with --all-tests, those of all layers of tests.
+# with --all-tests, those of all its layers but one, with --cluster those of `make test-cluster`.
 # As root on Debian or Ubuntu it installs them; otherwise it says exactly what to install, and what does not work without it, and goes on.
 set -euo pipefail
 PATH="$PATH:/usr/sbin:/sbin" # where an ordinary user of Debian has no ip and no ldconfig
@@ -13,6 +13,7 @@ need() { # need 'PACKAGES' 'WHAT DOES NOT WORK WITHOUT THEM' COMMAND...: the com
   missing+=("${packages[@]}")
   losses+=("$1: $2")
 }
+has_postgres() { command -v initdb || compgen -G "/usr/lib/postgresql/*/bin/initdb"; }
 has_egl() { [[ "$(ldconfig -p)" == *libEGL.so.1* ]]; }
 
 need bubblewrap "policies and agents run with --tier none --jail none only, make demo does not run, and tests fail" command -v bwrap
@@ -22,6 +23,9 @@ case "${1:-}" in --tests | --all-tests)
   need "libegl1 libegl-mesa0 libgl1-mesa-dri" "MuJoCo environments have no videos, and tests of videos are left out; everything else works" has_egl
   ;;
 esac
+if [ "${1:-}" = "--cluster" ]; then
+  need postgresql "the tests of the store on PostgreSQL are left out" has_postgres
+fi
 if [ "${1:-}" = "--all-tests" ]; then
   need "gcc libc6-dev" "the tests with bad clocks and bad disks fail" command -v cc
   need "slurmctld slurmd slurm-client munge" "the tests on Slurm are left out" command -v slurmctld

@@ -20,12 +20,14 @@ from parallel import Parallel
 
 if TYPE_CHECKING:
     from forked import Forks
+    from machines.postgres import Server
     from slots import Slots
 
 _LEFT_OUT: dict[str, Callable[[bytes], object]] = {
-    "not system and not families": (
-        re.compile(rb"^pytestmark = \[?\s*pytest\.mark\.(system|families)\b", re.MULTILINE).search
+    "not system and not families and not cluster": (
+        re.compile(rb"^pytestmark = \[?\s*pytest\.mark\.(system|families|cluster)\b", re.MULTILINE).search
     ),
+    "cluster": lambda text: b"pytest.mark.cluster" not in text,
     "system or families": lambda text: (
         b"pytest.mark.system" not in text and b"pytest.mark.families" not in text
     ),
@@ -51,7 +53,7 @@ _ONE_BY_ONE = (
     "tests/unit/worker/runtime/test_foreign_slots.py::",
 )
 """Their tests share nothing and take minutes together: each is played where there is room."""
-_SHARED = ("cheated", "forked")
+_SHARED = ("cheated", "forked", "server")
 """Fixtures that files share: a cluster to be cheated, and a process with all commands imported."""
 
 
@@ -159,6 +161,18 @@ def forked() -> Iterator[Forks]:
 def one_process(monkeypatch: pytest.MonkeyPatch) -> None:
     """Commands that would compute in a process for each core do so in this one, which has imported everything."""
     monkeypatch.setattr(os, "cpu_count", lambda: 1)
+
+
+@pytest.fixture(scope="session")
+def server() -> Iterator[Server]:
+    """A PostgreSQL server; commands find its password."""
+    from machines.postgres import Server
+
+    found = Server()
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setenv("PGPASSFILE", str(found.passfile))
+        yield found
+    found.close()
 
 
 @pytest.fixture(scope="session")

@@ -21,6 +21,7 @@ from evopolicy_common.terminal import say, say_json
 from evopolicy_common.wire.credentials import default_state_dir, no_state
 from evopolicy_coordinator import splits
 from evopolicy_coordinator.pki.identity import public_key, sign
+from evopolicy_coordinator.storage.engines import place_of
 from evopolicy_coordinator.storage.state_folder import StateFolder
 from evopolicy_coordinator.storage.store import Reader
 from evopolicy_results.publish.contents import Countersignature, document, head_digest
@@ -124,11 +125,8 @@ def _current(root: Path) -> str:
 
 
 def _journal(root: Path) -> list[bytes]:
-    database = root / "coordinator.sqlite"
-    if not database.is_file():
-        raise no_state(root, database.name)
     entries: list[bytes] = []
-    with contextlib.closing(Reader(database)) as reader:
+    with contextlib.closing(Reader(place_of(root))) as reader:
         while page := reader.journal(len(entries), _PAGE_BYTES):
             entries += [row.entry for row in page]
     return entries

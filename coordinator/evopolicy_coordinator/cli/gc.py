@@ -46,7 +46,7 @@ def collect(
         f" {bytes_text(done.bytes)}; {bytes_text(done.free_bytes)} free"
     )
     if not dry_run and not done.shrunk:
-        say("a coordinator is running: the database keeps its size, and new runs use the freed space")
+        say("the database keeps its size, and new runs use the freed space")
 
 
 @disk_app.command(epilog="Example: evopolicy disk --env core16 --budget 128 --runs 5")

@@ -25,6 +25,7 @@ from evopolicy_coordinator.core.contract.settings import CoreSettings
 from evopolicy_coordinator.server import process
 from evopolicy_coordinator.server.process import Options
 from evopolicy_coordinator.storage.backup import back_up
+from evopolicy_coordinator.storage.moving import move
 
 app = App()
 app.add_typer(certs_cli.app, name="certs")
@@ -57,6 +58,14 @@ def serve(
         ),
     ] = None,
     state: State = None,
+    store: Annotated[
+        str | None,
+        typer.Option(
+            metavar="ADDRESS",
+            help="Keep the rows in PostgreSQL: postgresql://USER@HOST/DATABASE, without a password (see ~/.pgpass)."
+            " Default: as the state folder says, SQLite for a new one.",
+        ),
+    ] = None,
     data: Annotated[
         Path | None,
         typer.Option(
@@ -145,6 +154,7 @@ def serve(
     options = Options(
         state=state or default_state_dir(),
         data=data,
+        store=store,
         listen=tuple(listen or ()),
         insecure_tcp=insecure_tcp,
         cluster=cluster,
@@ -175,6 +185,29 @@ def backup(
     """
     copied = back_up(state or default_state_dir(), target)
     say(f"{copied.path}: database and {counted(copied.blobs, 'blob')}, {copied.bytes:,} bytes")
+
+
+@app.command(
+    "move",
+    epilog="Example: evopolicy-coordinator move --to postgresql://evopolicy@db/evopolicy --state /var/lib/evopolicy",
+)
+def move_(
+    to: Annotated[
+        str,
+        typer.Option(
+            help="postgresql://USER@HOST/DATABASE of an empty database, or `sqlite`.", show_default=False
+        ),
+    ],
+    state: State = None,
+) -> None:
+    """Move the rows of a stopped coordinator into PostgreSQL, or back into the state folder.
+
+    The copy is compared row by row before the state folder names it. Blobs and keys stay in the folder.
+    """
+    moved = move(state or default_state_dir(), to)
+    n_rows = counted(sum(moved.rows.values()), "row")
+    say(f"{n_rows} moved from {moved.source} to {moved.target}; journal head {moved.head}")
+    say("next: start the coordinator on the same state folder")
 
 
 async def _run(options: Options, announce: Callable[[bytes], None]) -> None:

@@ -33,6 +33,7 @@ from evopolicy_coordinator.server.run_requests import RunRequests
 from evopolicy_coordinator.server.service import Service
 from evopolicy_coordinator.server.uploads import Uploads
 from evopolicy_coordinator.splits import SplitSource, load_or_create_secret, secret_of
+from evopolicy_coordinator.storage.engines import checked_address, chosen_place, record_place
 from evopolicy_coordinator.storage.state_folder import ROLES, StateFolder, reachable, resolve_listen
 from evopolicy_coordinator.storage.store import Store
 from evopolicy_coordinator.worlds import JOURNAL
@@ -46,6 +47,8 @@ class Options(msgspec.Struct, frozen=True, kw_only=True):
     state: Path
     data: Path | None = None
     """Folder of split files; None: derive the splits from the state folder's secret."""
+    store: str | None = None
+    """Address of a PostgreSQL database; None: as the state folder says, else SQLite."""
     listen: tuple[str, ...] = ()
     """Endpoints besides the unix socket in the state folder; port 0 picks a free port."""
     insecure_tcp: bool = False
@@ -69,6 +72,8 @@ async def run(options: Options, stop: asyncio.Event, on_ready: Callable[[Ready],
     Raises ConfigError for wrong options or a folder that is in use, StorageError when the store cannot be read,
     TransportError when it cannot listen on an endpoint, PartFailedError when a part cannot continue.
     """
+    if options.store is not None:
+        checked_address(options.store)  # before anything is created
     async with contextlib.AsyncExitStack() as opened:
         state = StateFolder.open(options.state, options.cluster)
         opened.callback(state.close)
@@ -83,8 +88,10 @@ async def run(options: Options, stop: asyncio.Event, on_ready: Callable[[Ready],
         load_or_create_secret(
             state.root / SIGNING_KEY
         )  # now, so that every backup has it: runs are named from it
-        store = Store(state.database)
+        place = chosen_place(state.root, options.store)
+        store = Store(place, state.identity.operator_token)
         opened.callback(store.close)
+        record_place(state.root, place)
         (state.root / PROCESSES).unlink(missing_ok=True)
         ended = state.root / WORKERS_ENDED
         if ended.exists():
@@ -95,7 +102,7 @@ async def run(options: Options, stop: asyncio.Event, on_ready: Callable[[Ready],
         blobs = BlobStore(state.root / "blobs")
         blobs.drop_unfinished()
         uploads = Uploads()
-        reader = ServiceReader(state.database, blobs, uploads)
+        reader = ServiceReader(place, blobs, uploads, state.root)
         allowed = ("numpy", *options.allowed_packages)
         runs = RunRequests(reader, blobs, source, allowed_imports=allowed, denied_imports=SIMULATORS)
         definitions = Definitions(

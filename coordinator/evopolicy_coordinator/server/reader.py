@@ -54,6 +54,7 @@ from evopolicy_coordinator.pki import identity
 from evopolicy_coordinator.server.reason_texts import env_failure, operator_words, words
 from evopolicy_coordinator.server.request_checks import MAX_COUNT, finite_cursor, require
 from evopolicy_coordinator.server.uploads import Uploads
+from evopolicy_coordinator.storage.engines import Place
 from evopolicy_coordinator.storage.store import Reader
 
 log: structlog.stdlib.BoundLogger = structlog.get_logger()
@@ -71,8 +72,8 @@ class ServiceReader:
     """Reads pages and blobs. The methods that take an `Answer` return at once; a thread sends the reply later.
     Those that read the database at once raise DamagedStoreError when a row cannot be read."""
 
-    def __init__(self, database: Path, blobs: BlobStore, uploads: Uploads) -> None:
-        self.state = database.parent
+    def __init__(self, database: Place, blobs: BlobStore, uploads: Uploads, state: Path) -> None:
+        self.state = state
         """The state folder."""
         self.storage_error = ""
         """Why the last chunk of a blob could not be written; empty: it was."""

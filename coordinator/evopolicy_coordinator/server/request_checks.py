@@ -102,9 +102,9 @@ def check_token(expected: str, given: str) -> None:
 
 
 def check_idempotency_key(key: str) -> None:
-    """Checks the key's length."""
-    text = f"an idempotency key has 1 to {_MAX_NAME} characters, not {len(key)}"
-    require(1 <= len(key) <= _MAX_NAME, Refusal.BAD_MESSAGE, text)
+    """Checks the key's length, and that PostgreSQL can store it."""
+    text = f"an idempotency key has 1 to {_MAX_NAME} characters, not {len(key)}, and none is NUL"
+    require(1 <= len(key) <= _MAX_NAME and "\0" not in key, Refusal.BAD_MESSAGE, text)
 
 
 def check_registration(message: worker.Register) -> None:

@@ -1,8 +1,8 @@
 """Backups of a state folder, also of one whose coordinator is running.
 
 Rules:
-- The database is copied first, as of one instant (SQLite's online backup), the blobs after it. A blob is durable
-  before any row names it, so the copy contains every blob that its rows name.
+- The database is copied first, as of one instant (SQLite's online backup, a server's rows into a SQLite file), the
+  blobs after it. A blob is durable before any row names it, so the copy contains every blob that its rows name.
 - A backup is built under a temporary name and renamed at the end, so an existing backup is complete, durable and
   checked.
 - A backup is a state folder. To restore it, copy it to the old state's path and start a coordinator on it. Workers
@@ -21,13 +21,15 @@ import msgspec
 
 from evopolicy_common.errors import ConfigError, StorageError
 from evopolicy_common.records.blobs import BlobStore, fsync_directory, write_atomically
-from evopolicy_common.wire.credentials import no_state
 from evopolicy_coordinator.pki.identity import SIGNING_KEY
 from evopolicy_coordinator.splits import SECRET, UNJAILED_SECRET
-from evopolicy_coordinator.storage.store import DATABASE
+from evopolicy_coordinator.storage.engines import DATABASE, Place, connect, place_of
+from evopolicy_coordinator.storage.moving import copy_rows
+from evopolicy_coordinator.storage.store import Store
 from evopolicy_coordinator.worlds import JOURNAL
 
 _CERTS = ("ca.pem", "ca-key.pem", "coordinator.pem", "coordinator-key.pem", "machines.json")
+_TIMEOUT_S = 30.0
 KEPT_FILES = (SECRET, UNJAILED_SECRET, "identity.json", SIGNING_KEY, JOURNAL, *(f"certs/{n}" for n in _CERTS))
 """The cluster's identity, besides its database and blobs. A start creates everything else again."""
 
@@ -47,8 +49,7 @@ def back_up(state: Path, target: Path) -> Backup:
     Raises ConfigError when there is no state or no place for the copy, StorageError when the disk refuses or the copy
     is damaged; nothing is then left at `target`.
     """
-    if not (state / DATABASE).is_file():
-        raise no_state(state, DATABASE)
+    source = place_of(state)
     if target.exists() and (not target.is_dir() or any(target.iterdir())):
         raise ConfigError(f"{target} already exists; name a new folder for the backup")
     partial = target.with_name(f".{target.name}.partial")
@@ -56,7 +57,7 @@ def back_up(state: Path, target: Path) -> Backup:
         if partial.exists():
             shutil.rmtree(partial)
         partial.mkdir(parents=True, mode=0o700)
-        blobs, size = _copy(state, partial)
+        blobs, size = _copy(state, source, partial)
         os.replace(partial, target)
         fsync_directory(target.parent)
     except OSError as error:
@@ -66,7 +67,7 @@ def back_up(state: Path, target: Path) -> Backup:
     return Backup(path=str(target), blobs=blobs, bytes=size)
 
 
-def _copy(state: Path, folder: Path) -> tuple[int, int]:
+def _copy(state: Path, place: Place, folder: Path) -> tuple[int, int]:
     """Returns the number of blobs, and the bytes of database and blobs."""
     for name in KEPT_FILES:
         # Splits from files need no secret, a single machine no certificates.
@@ -75,7 +76,7 @@ def _copy(state: Path, folder: Path) -> tuple[int, int]:
             (folder / name).parent.mkdir(mode=0o700, exist_ok=True)
             write_atomically(folder / name, data, mode=0o600)
     database = folder / DATABASE
-    _copy_database(state / DATABASE, database)
+    _copy_database(place, database)
     source, blobs = BlobStore(state / "blobs"), BlobStore(folder / "blobs")
     count, total = 0, database.stat().st_size
     for digest in source.digests():
@@ -85,8 +86,14 @@ def _copy(state: Path, folder: Path) -> tuple[int, int]:
     return count, total
 
 
-def _copy_database(source: Path, target: Path) -> None:
+def _copy_database(source: Place, target: Path) -> None:
     """Makes a consistent copy while others write: readable by its owner only, durable, checked."""
+    if isinstance(source, str):
+        Store(target).close()
+        old, new = connect(source, "ro", _TIMEOUT_S), connect(target, "rwc", _TIMEOUT_S)
+        with contextlib.closing(old), contextlib.closing(new):
+            copy_rows(old, new)
+            return
     try:
         with (
             contextlib.closing(sqlite3.connect(f"{source.absolute().as_uri()}?mode=ro", uri=True)) as reader,

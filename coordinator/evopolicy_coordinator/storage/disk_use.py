@@ -13,17 +13,15 @@ from __future__ import annotations
 import contextlib
 import os
 import shutil
-import sqlite3
 import time
 from collections.abc import Iterator
 from pathlib import Path
 
 import msgspec
 
-from evopolicy_common.errors import ConfigError
+from evopolicy_common.errors import ConfigError, StorageError
 from evopolicy_common.messages.status import DiskUse
 from evopolicy_common.records.blobs import BlobStore
-from evopolicy_common.wire.credentials import no_state
 from evopolicy_coordinator.core.contract.records import (
     BegunRow,
     EvaluationRow,
@@ -33,14 +31,16 @@ from evopolicy_coordinator.core.contract.records import (
     SubmitRow,
     evaluation_group,
 )
+from evopolicy_coordinator.storage.engines import DATABASE, Database, connect, place_of
 from evopolicy_coordinator.storage.state_folder import lock
-from evopolicy_coordinator.storage.store import DATABASE, rows, storage_errors, stored_blobs
+from evopolicy_coordinator.storage.store import rows, stored_blobs
 
 Bounds = tuple[str, str]
 """Group ids from the first (inclusive) to the second (exclusive)."""
 
 UNNAMED_S = 24 * 3600.0
 BUSY_TIMEOUT_S = 30.0
+_TRAIN = "%/train"
 GUESS_BYTES = 1 << 20
 """Bytes assumed for an episode when nothing is stored of any environment."""
 
@@ -107,7 +107,7 @@ def collect(
         )
         old_evaluations = [row.evaluation for row in old]
         groups = [evaluation_group(evaluation) for evaluation in old_evaluations]
-        gone = [*map(_of_run, old_runs), *((group, f"{group}\0") for group in groups)]
+        gone = [*map(_of_run, old_runs), *((group, f"{group}\x01") for group in groups)]
         named = _named(db, frozenset(old_runs), frozenset(old_evaluations))
         sizes = [_size(db, bounds) for bounds in gone]
         unnamed = [
@@ -137,11 +137,22 @@ def collect(
 
 
 def sizes(state: Path) -> DiskUse:
-    """Size of the state folder's database files, and of their disk. Raises OSError."""
+    """Size of the database, and the state folder's disk. Raises OSError."""
     disk = shutil.disk_usage(state)
+    with contextlib.suppress(ConfigError):
+        if isinstance(place_of(state), str):
+            return DiskUse(database=_server_bytes(state), free=disk.free, total=disk.total)
     with os.scandir(state) as entries:
         database = sum(entry.stat().st_size for entry in entries if entry.name.startswith(DATABASE))
     return DiskUse(database=database, free=disk.free, total=disk.total)
+
+
+def _server_bytes(state: Path) -> int:
+    try:
+        with _database(state) as db:
+            return int(db.execute("SELECT pg_database_size(current_database())").fetchone()[0])
+    except StorageError as error:
+        raise OSError(str(error)) from error
 
 
 def use(state: Path) -> list[EnvironmentUse]:
@@ -149,10 +160,10 @@ def use(state: Path) -> list[EnvironmentUse]:
     by_env: dict[str, EnvironmentUse] = {}
     with _database(state) as db:
         blobs = BlobStore(state / "blobs")
-        for run in rows(db, RunRow):
+        for run in tuple(rows(db, RunRow)):
             train = db.execute(
-                "SELECT COUNT(*) FROM outcomes WHERE grp >= ? AND grp < ? AND grp LIKE '%/train'",
-                _of_run(run.run),
+                "SELECT COUNT(*) FROM outcomes WHERE grp >= ? AND grp < ? AND grp LIKE ?",
+                (*_of_run(run.run), _TRAIN),
             ).fetchone()[0]
             if not train:
                 continue
@@ -178,17 +189,9 @@ def estimate(state: Path, planned: dict[str, int]) -> Estimate:
 
 
 @contextlib.contextmanager
-def _database(state: Path) -> Iterator[sqlite3.Connection]:
-    path = state / DATABASE
-    if not path.is_file():
-        raise no_state(state, DATABASE)
-    uri = f"{path.absolute().as_uri()}?mode=rw"
-    with (
-        storage_errors(path),
-        contextlib.closing(
-            sqlite3.connect(uri, uri=True, timeout=BUSY_TIMEOUT_S, isolation_level=None)
-        ) as db,
-    ):
+def _database(state: Path) -> Iterator[Database]:
+    db = connect(place_of(state), "rw", BUSY_TIMEOUT_S)
+    with contextlib.closing(db), db.errors():
         yield db
 
 
@@ -196,33 +199,30 @@ def _of_run(run: str) -> Bounds:
     return f"{run}/", f"{run}0"  # "0" is the character after "/"
 
 
-def _size(db: sqlite3.Connection, bounds: Bounds) -> tuple[int, int]:
+def _size(db: Database, bounds: Bounds) -> tuple[int, int]:
     """Number and bytes of the outcomes of these groups."""
-    query = "SELECT COUNT(*), IFNULL(SUM(LENGTH(head) + LENGTH(data)), 0) FROM outcomes WHERE grp >= ? AND grp < ?"
+    query = "SELECT COUNT(*), COALESCE(SUM(LENGTH(head) + LENGTH(data)), 0) FROM outcomes WHERE grp >= ? AND grp < ?"
     n, size = db.execute(query, bounds).fetchone()
-    return n, size
+    return n, int(size)
 
 
-def _delete(db: sqlite3.Connection, bounds: Bounds) -> None:
+def _delete(db: Database, bounds: Bounds) -> None:
     """Deletes these rows in one short transaction, so that a running coordinator never waits long."""
-    db.execute("BEGIN IMMEDIATE")
-    for table in ("outcomes", "begun"):
-        db.execute(f"DELETE FROM {table} WHERE grp >= ? AND grp < ?", bounds)
-    db.execute("COMMIT")
+    with db.transaction():
+        for table in ("outcomes", "begun"):
+            db.execute(f"DELETE FROM {table} WHERE grp >= ? AND grp < ?", bounds)
 
 
-def _named(
-    db: sqlite3.Connection, old_runs: frozenset[str], old_evaluations: frozenset[str]
-) -> set[str | None]:
+def _named(db: Database, old_runs: frozenset[str], old_evaluations: frozenset[str]) -> set[str | None]:
     """Digests of all blobs that the remaining rows name."""
     named = {row.bundle for row in rows(db, SubmitRow) if row.run not in old_runs}
     for evaluation in rows(db, EvaluationRow):
         if evaluation.evaluation not in old_evaluations:
             named |= {ref.digest for ref in evaluation.replays} | {evaluation.bundle}
-    train_blobs = db.execute("SELECT run, digest FROM train_blobs")
+    train_blobs = db.stream("SELECT run, digest FROM train_blobs")
     named |= {digest for run, digest in train_blobs if run not in old_runs}
     named |= {row.begun.digest for row in rows(db, BegunRow) if row.begun is not None}
-    for row in rows(db, OutcomeRow, "WHERE grp NOT LIKE '%/train'"):
+    for row in rows(db, OutcomeRow, "WHERE grp NOT LIKE ?", (_TRAIN,)):
         head, _, tail = row.group.partition("/")
         if head not in old_runs and not (head == "evaluation" and tail in old_evaluations):
             named |= {ref.digest for ref in stored_blobs(row.outcome)}
@@ -235,8 +235,11 @@ def _age_s(blobs: BlobStore, digest: str, now: float) -> float:
     return 0.0
 
 
-def _shrink(state: Path, db: sqlite3.Connection) -> bool:
-    """Returns the file's free pages to the disk, unless a coordinator would have to wait for it."""
+def _shrink(state: Path, db: Database) -> bool:
+    """Returns a file's free pages to the disk, unless a coordinator would have to wait for it. A server does so by
+    itself."""
+    if not isinstance(db.place, Path):
+        return False
     try:
         fd = lock(state)
     except ConfigError:

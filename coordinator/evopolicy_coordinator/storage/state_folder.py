@@ -8,6 +8,7 @@
       passwords                   the same passwords, for Zenoh's router
       credentials/<role>.json     the credentials of workers, gateways and operators on this machine
       coordinator.sqlite          the authoritative state
+      store                       the address of the PostgreSQL database that has it instead
       blobs/                      trajectories, videos and policy bundles
       coordinator.sock            the socket for processes of this machine
 
@@ -34,7 +35,6 @@ from evopolicy_common.processes.preflight import check_writable, refused
 from evopolicy_common.records.blobs import write_atomically
 from evopolicy_common.wire import credentials, keys
 from evopolicy_common.wire.credentials import Credentials, Role
-from evopolicy_coordinator.storage.store import DATABASE
 
 ROLES: tuple[Role, ...] = ("worker", "gateway", "operator")
 _SOCKET = "coordinator.sock"
@@ -58,7 +58,6 @@ class StateFolder:
     def __init__(self, root: Path, lock_fd: int, identity: Identity) -> None:
         self.root = root
         self.identity = identity
-        self.database = root / DATABASE
         self.passwords = root / "passwords"
         """The file that Zenoh's router reads: a line `user:password` for each role."""
         self.credentials = root / "credentials"

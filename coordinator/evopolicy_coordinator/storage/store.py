@@ -1,8 +1,10 @@
 """The database: every row that the core persists, and nothing else.
 
 Rules that this module owns:
-- WAL with synchronous=FULL: when `write` returns, its rows survive a power cut; when it raises, none of them are
-  stored.
+- When `write` returns, its rows are as durable as the engine makes them; when it raises, the caller loads the rows
+  again, since a lost connection leaves open whether they are stored.
+- Every transaction checks the incarnation that `load` has set, so that a coordinator that lost the database to another
+  writes nothing.
 - One connection writes (`Store`, from one thread at a time); any number read (`Reader`, one connection per thread).
 - A row is its msgpack bytes plus its lookup columns. A database of another schema is refused.
 - A disk that refuses may accept a write later (StorageError); an unreadable row stays unreadable (DamagedStoreError).
@@ -13,10 +15,10 @@ Rules that this module owns:
 from __future__ import annotations
 
 import contextlib
+import hashlib
+import itertools
 import operator
-import sqlite3
 from collections.abc import Callable, Iterable, Iterator
-from pathlib import Path
 from typing import Any, NamedTuple, TypeVar, get_args
 
 import msgspec
@@ -26,14 +28,14 @@ from evopolicy_common.messages.episode import BlobRef, EpisodeOutcome
 from evopolicy_common.messages.operator import RunFinished
 from evopolicy_common.records.splits import SPLITS
 from evopolicy_coordinator.core.contract import records
+from evopolicy_coordinator.storage.engines import Database, Place, connect
 
 T = TypeVar("T")
 
-DATABASE = "coordinator.sqlite"
-"""Name of the file in a state folder."""
 BUSY_TIMEOUT_S = 10.0
 """How long to wait for another process's transaction: `evopolicy gc` runs beside a coordinator."""
 
+_PAGE_ROWS = 10_000
 SCHEMA = 6
 """Version of the tables and of the rows in them."""
 TABLES = {
@@ -57,11 +59,6 @@ TABLES = {
     "journal": "seq INTEGER PRIMARY KEY, reveals TEXT NOT NULL, data BLOB NOT NULL",
     "documents": "run TEXT NOT NULL, kind TEXT NOT NULL, data BLOB NOT NULL, PRIMARY KEY (run, kind)",
 }
-_JOURNAL_GROWS = tuple(
-    f"CREATE TRIGGER journal_{when} BEFORE {when} ON journal"
-    " BEGIN SELECT RAISE(ABORT, 'the journal is only appended to'); END"
-    for when in ("UPDATE", "DELETE")
-)
 
 _encode = msgspec.msgpack.Encoder().encode
 
@@ -111,55 +108,58 @@ _DECODERS: dict[type[Any], msgspec.msgpack.Decoder[Any]] = {
 class Store:
     """The writing connection. Threads must not use it at the same time."""
 
-    def __init__(self, path: Path) -> None:
-        """Opens or creates the database. Raises ConfigError for another schema, StorageError."""
-        self._path = path
-        self._db = _connect(path)
+    def __init__(self, place: Place, owner: str = "") -> None:
+        """Opens or creates the database. `owner`: a secret of the state folder, whose digest is kept.
+
+        Raises ConfigError for another schema or the database of another state folder, StorageError."""
+        self._db = connect(place, "rwc", BUSY_TIMEOUT_S)
+        self._incarnation = 0
         try:
-            with storage_errors(path):
-                self._prepare()
+            with self._db.errors():
+                self._prepare(
+                    int.from_bytes(hashlib.sha256(owner.encode()).digest()[:6], "big") if owner else 0
+                )
         except BaseException:
             self._db.close()
             raise
 
-    def _prepare(self) -> None:
-        self._db.execute("PRAGMA journal_mode=WAL")
-        self._db.execute("PRAGMA synchronous=FULL")
-        with self._transaction():
-            if self._db.execute("SELECT 1 FROM sqlite_master WHERE name = 'meta'").fetchone() is None:
-                for name, columns in TABLES.items():
-                    self._db.execute(f"CREATE TABLE {name} ({columns})")
-                for statement in _JOURNAL_GROWS:
-                    self._db.execute(statement)
-                self._db.execute("INSERT INTO meta VALUES ('incarnation', 0), ('schema', ?)", (SCHEMA,))
-        found = self._db.execute("SELECT value FROM meta WHERE name = 'schema'").fetchone()
-        if found != (SCHEMA,):
+    def _prepare(self, owner: int) -> None:
+        db = self._db
+        with db.transaction():
+            if not db.has_table("meta"):
+                db.create(TABLES)
+                db.execute("INSERT INTO meta VALUES ('incarnation', 0), ('schema', ?)", (SCHEMA,))
+        found = dict(db.execute("SELECT name, value FROM meta").fetchall())
+        if found.get("schema") != SCHEMA:
             raise ConfigError(
-                f"{self._path} has schema {found[0] if found else 'unknown'}, and this version of evopolicy reads"
+                f"{db.place} has schema {found.get('schema', 'unknown')}, and this version of evopolicy reads"
                 f" {SCHEMA} only: use the version that wrote it, or another folder with --state"
             )
+        if owner and found.get("owner", owner) != owner:
+            raise ConfigError(
+                f"{db.place} is of another state folder: name a database of its own with --store"
+            )
+        if owner and "owner" not in found:
+            db.execute("INSERT INTO meta VALUES ('owner', ?)", (owner,))
 
     def write(self, changed: Iterable[records.Row]) -> None:
         """Writes all rows in one durable transaction. Raises StorageError when it fails; then no row is stored."""
-        with storage_errors(self._path), self._transaction():
+        with self._transaction(), self._db.batch():
             for row in changed:
                 _write_row(self._db, row)
 
     @contextlib.contextmanager
     def _transaction(self) -> Iterator[None]:
-        """A transaction that is durable at the end of the `with` and rolled back on an error."""
-        try:
-            self._db.execute("BEGIN IMMEDIATE")
+        """A durable transaction. Raises StorageError when another coordinator has loaded the rows since `load`."""
+        with self._db.errors(), self._db.transaction():
+            query = f"SELECT value FROM meta WHERE name = 'incarnation'{self._db.shared}"
+            if self._incarnation and self._db.execute(query).fetchone() != (self._incarnation,):
+                raise StorageError(f"{self._db.place}: another coordinator has taken over")
             yield
-            self._db.execute("COMMIT")
-        except BaseException:
-            if self._db.in_transaction:
-                self._db.execute("ROLLBACK")
-            raise
 
     def forget_kernels(self, boot_id: str) -> None:
         """Durably deletes the records of which workers were on that kernel: those workers are known to have ended."""
-        with storage_errors(self._path), self._transaction():
+        with self._transaction():
             for row in list(rows(self._db, records.KernelRow)):
                 if row.boot_id == boot_id:
                     self._db.execute("DELETE FROM kernels WHERE worker = ?", (row.worker,))
@@ -167,24 +167,23 @@ class Store:
     def write_claim(self, suite: str, name: str, data: bytes) -> None:
         """Stores a sweep's claim durably. Raises StorageError when it fails."""
         replace = "ON CONFLICT (suite, name) DO UPDATE SET data = excluded.data"
-        with storage_errors(self._path):
+        with self._transaction():
             self._db.execute(f"INSERT INTO claims VALUES (?, ?, ?) {replace}", (suite, name, data))
 
     def claims(self) -> list[tuple[str, str, bytes]]:
         """All claims of sweeps: suite, name and stored bytes."""
-        with storage_errors(self._path):
-            return self._db.execute("SELECT suite, name, data FROM claims").fetchall()
+        with self._db.errors():
+            return list(self._db.execute("SELECT suite, name, data FROM claims"))
 
     def load(self) -> records.Snapshot:
         """Durably increments the incarnation, then reads the state that a core starts from."""
-        with storage_errors(self._path):
-            with self._transaction():
+        with self._db.errors():
+            with self._db.transaction():
                 self._db.execute("UPDATE meta SET value = value + 1 WHERE name = 'incarnation'")
-            self._db.execute("BEGIN")
-            try:
-                return self._snapshot()
-            finally:
-                self._db.execute("ROLLBACK")
+            with self._db.transaction(self._db.begin_reading):
+                snapshot = self._snapshot()
+        self._incarnation = snapshot.incarnation
+        return snapshot
 
     def _snapshot(self) -> records.Snapshot:
         db = self._db
@@ -213,25 +212,20 @@ class Store:
             workers=tuple(rows(db, records.WorkerRow)),
             permits=tuple(rows(db, records.PermitRow, "WHERE ended = 0")),
             kernels=tuple(rows(db, records.KernelRow)),
-            journal=next(rows(db, records.JournalRow, "ORDER BY seq DESC LIMIT 1"), None),
+            journal=_only(rows(db, records.JournalRow, "ORDER BY seq DESC LIMIT 1")),
             revealed=tuple(revealed(db)),
         )
 
     def close(self) -> None:
-        """Checkpoints the write-ahead log into the database if possible, and closes."""
-        with contextlib.suppress(
-            sqlite3.Error
-        ):  # all is durable in the log, which the next start checkpoints
-            self._db.execute("PRAGMA wal_checkpoint(TRUNCATE)")
+        """Closes the connection."""
         self._db.close()
 
 
 class Reader:
     """A reading connection for one thread; it sees durable rows."""
 
-    def __init__(self, path: Path) -> None:
-        self._path = path
-        self._db = _connect(path, read_only=True)
+    def __init__(self, place: Place) -> None:
+        self._db = connect(place, "ro", BUSY_TIMEOUT_S)
 
     def outcomes(self, group: str, cursor: int, upto: int, max_bytes: int) -> tuple[records.OutcomeRow, ...]:
         """Outcomes with cursor ≤ seq < upto in order of `seq`, up to `max_bytes` of rows but at least one."""
@@ -241,12 +235,12 @@ class Reader:
     def one(self, kind: type[T], /, **key: object) -> T | None:
         """The row of a kind with this key, by column; None when it is missing."""
         where = " AND ".join(f"{column} = ?" for column in key)
-        with storage_errors(self._path):
-            return next(rows(self._db, kind, f"WHERE {where}", tuple(key.values())), None)
+        with self._db.errors():
+            return _only(rows(self._db, kind, f"WHERE {where}", tuple(key.values())))
 
     def bundles(self, run: str) -> frozenset[str | None]:
         """The bundles that the run's submits name."""
-        with storage_errors(self._path):
+        with self._db.errors():
             return frozenset(row.bundle for row in rows(self._db, records.SubmitRow, "WHERE run = ?", (run,)))
 
     def finished(self, run: str) -> RunFinished | None:
@@ -260,94 +254,52 @@ class Reader:
 
     def revealed(self) -> frozenset[str]:
         """Epochs whose secret is revealed."""
-        with storage_errors(self._path):
+        with self._db.errors():
             return frozenset(revealed(self._db))
 
     def names_blob(self, run: str, digest: str) -> bool:
         """Whether the train feedback of `run` names the blob."""
         query = "SELECT 1 FROM train_blobs WHERE run = ? AND digest = ?"
-        with storage_errors(self._path):
+        with self._db.errors():
             return self._db.execute(query, (run, digest)).fetchone() is not None
 
     def _page(self, kind: type[T], where: str, args: tuple[Any, ...], max_bytes: int) -> tuple[T, ...]:
         """Rows of up to `max_bytes`, but at least one if there is any."""
-        page: list[T] = []
-        total = 0
-        with storage_errors(self._path):
-            for row, n_bytes in _sized_rows(self._db, kind, where, args):
-                total += n_bytes
-                if page and total > max_bytes:
-                    break
-                page.append(row)
-        return tuple(page)
+        place = _PLACES[kind]
+        sizes = f"SELECT LENGTH({place.column}) FROM {place.table} {where} LIMIT {_PAGE_ROWS}"
+        with self._db.errors():
+            totals = itertools.accumulate(size for (size,) in self._db.execute(sizes, args).fetchall())
+            n = max(1, sum(total <= max_bytes for total in totals))
+            return tuple(rows(self._db, kind, f"{where} LIMIT {n}", args))
 
     def close(self) -> None:
         """Closes the connection."""
         self._db.close()
 
 
-def _connect(path: Path, *, read_only: bool = False) -> sqlite3.Connection:
-    try:
-        db = sqlite3.connect(
-            f"{path.absolute().as_uri()}?mode={'ro' if read_only else 'rwc'}",
-            uri=True,
-            timeout=BUSY_TIMEOUT_S,
-            isolation_level=None,
-            # One thread uses a connection at a time, but another may have opened it.
-            check_same_thread=False,
-        )
-    except sqlite3.Error as error:
-        raise StorageError(f"cannot open {path}: {error}") from error
-    if not read_only:
-        path.chmod(0o600)
-    return db
-
-
-@contextlib.contextmanager
-def storage_errors(path: Path) -> Iterator[None]:
-    """Translates SQLite's errors into ours, and adds the database's path to DamagedStoreError."""
-    try:
-        yield
-    except sqlite3.DatabaseError as error:
-        if isinstance(error, sqlite3.IntegrityError):
-            raise DamagedStoreError(f"{path} refuses a row that contradicts another: {error}") from error
-        # Operational errors are the machine's (full, locked, I/O), except for statements that do not fit the tables.
-        if (
-            isinstance(error, sqlite3.OperationalError)
-            and error.sqlite_errorcode & 0xFF != sqlite3.SQLITE_ERROR
-        ):
-            raise StorageError(f"{path}: {error}") from error
-        raise DamagedStoreError(f"{path} cannot be used: {error}; restore it from a backup") from error
-    except DamagedStoreError as error:
-        raise DamagedStoreError(f"{path}: {error}") from error
-
-
-def rows(db: sqlite3.Connection, kind: type[T], where: str = "", args: tuple[Any, ...] = ()) -> Iterator[T]:
-    """The rows of a kind. Raises DamagedStoreError with the unreadable row's key."""
-    for row, _ in _sized_rows(db, kind, where, args):
-        yield row
-
-
-def _sized_rows(
-    db: sqlite3.Connection, kind: type[T], where: str, args: tuple[Any, ...]
-) -> Iterator[tuple[T, int]]:
-    """Yields each row with its size in bytes."""
+def rows(db: Database, kind: type[T], where: str = "", args: tuple[Any, ...] = ()) -> Iterator[T]:
+    """The rows of a kind; until they are exhausted, `db` does nothing else. Raises DamagedStoreError with the
+    unreadable row's key."""
     place = _PLACES[kind]
     key = ", ".join(place.key)
     decode = _DECODERS[kind].decode
-    for *values, data in db.execute(f"SELECT {key}, {place.column} FROM {place.table} {where}", args):
+    for *values, data in db.stream(f"SELECT {key}, {place.column} FROM {place.table} {where}", args):
         try:
             row = decode(data)
         except DECODE_ERRORS as error:
             raise DamagedStoreError(
                 f"table {place.table}, row ({key}) = {tuple(values)}: {unreadable(error)}"
             ) from error
-        yield row, len(data)
+        yield row
 
 
-def revealed(db: sqlite3.Connection) -> Iterator[str]:
+def _only(found: Iterator[T]) -> T | None:
+    return next(iter(tuple(found)), None)
+
+
+def revealed(db: Database) -> Iterator[str]:
     """Epochs that the journal records as revealed."""
-    return (epoch for (epoch,) in db.execute("SELECT reveals FROM journal WHERE reveals != ''"))
+    return (epoch for (epoch,) in db.execute("SELECT reveals FROM journal WHERE reveals != ''").fetchall())
 
 
 def unreadable(error: Exception) -> str:
@@ -371,7 +323,7 @@ def _insert_of(place: _Place) -> tuple[str, tuple[Callable[[Any], object], ...]]
 _INSERTS = {kind: _insert_of(_PLACES[kind]) for kind in get_args(records.Row)}
 
 
-def _write_row(db: sqlite3.Connection, row: records.Row) -> None:
+def _write_row(db: Database, row: records.Row) -> None:
     statement, values = _INSERTS[type(row)]
     db.execute(statement, [value(row) for value in values])
     if isinstance(row, records.OutcomeRow) and (run := train_run(row.group)) is not None:

@@ -84,7 +84,7 @@ class World:
         self.store = Store(root / "db")
         self.blobs = BlobStore(root / "blobs")
         self.uploads = Uploads()
-        self.reader = ServiceReader(root / "db", self.blobs, self.uploads)
+        self.reader = ServiceReader(root / "db", self.blobs, self.uploads, root)
         source = SplitSource(data=data, secret=b"s" * 32)
         imports = {"allowed_imports": tuple(allowed_imports), "denied_imports": tuple(denied_imports)}
         runs = RunRequests(self.reader, self.blobs, source, **imports)

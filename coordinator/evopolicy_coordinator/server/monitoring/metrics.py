@@ -158,7 +158,7 @@ class StatusCollector(Collector):
 
 
 class _StoreCollector(Collector):
-    """Sizes of the state folder's database and of the free disk space."""
+    """Sizes of the database and of the free disk space."""
 
     def __init__(self, state: Path) -> None:
         self._state = state
@@ -166,7 +166,7 @@ class _StoreCollector(Collector):
     def collect(self) -> Iterator[Metric]:
         with contextlib.suppress(OSError):
             disk = sizes(self._state)
-            text = "Database files in the state folder."
+            text = "Size of the database."
             yield _gauge("evopolicy_store_database_bytes", text, disk.database)
             yield _gauge("evopolicy_store_free_bytes", "Free on the state folder's disk.", disk.free)
 

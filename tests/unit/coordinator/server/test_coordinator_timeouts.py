@@ -36,8 +36,8 @@ def test_a_database_that_another_keeps_locked_is_reported(
     monkeypatch.setattr(store, "BUSY_TIMEOUT_S", SOON_S)
     monkeypatch.setattr(disk_use, "BUSY_TIMEOUT_S", SOON_S)
     (tmp_path / "blobs").mkdir()
-    ours = Store(tmp_path / store.DATABASE)
-    other = sqlite3.connect(tmp_path / store.DATABASE, isolation_level=None)
+    ours = Store(tmp_path / "coordinator.sqlite")
+    other = sqlite3.connect(tmp_path / "coordinator.sqlite", isolation_level=None)
     other.execute("BEGIN IMMEDIATE")
     with pytest.raises(StorageError, match="locked"):
         ours.write_claim("suite", "name", b"")

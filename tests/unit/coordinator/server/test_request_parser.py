@@ -68,7 +68,7 @@ def make_parser(
         blobs or BlobStore(state),
         uploads or Uploads(),
     )
-    reader = ServiceReader(state / "db", blobs, uploads)
+    reader = ServiceReader(state / "db", blobs, uploads, state)
     runs = RunRequests(reader, blobs, source, allowed_imports=("numpy",), denied_imports=("gymnasium",))
     return RequestParser(IDENTITY, blobs, uploads, runs, Machines(state), Definitions())
 
@@ -221,8 +221,10 @@ def test_override_of_a_runs_class_needs_a_reason(parser: RequestParser) -> None:
     assert refused(parser, OPS, operator.RepinRun(**values, reason=" ")).status == "bad_message"
 
 
-@pytest.mark.parametrize("key", ["", "k" * 201])
-def test_idempotency_key_has_a_length(parser: RequestParser, key: str) -> None:
+@pytest.mark.parametrize("key", ["", "k" * 201, "k\0"])
+def test_idempotency_key_has_a_length_and_can_be_stored(parser: RequestParser, key: str) -> None:
+    """Attack: a gateway's key with a NUL, which PostgreSQL refuses, ends the coordinator at every start.
+    Defence: the request is refused."""
     failure = PolicyFailure(category="missing_policy", step_index=None, message="")
     assert refused(parser, SUBMIT, submit(key=key, bundle_error=failure)).status == "bad_message"
 

@@ -34,7 +34,7 @@ class Rig:
         self.store = Store(root / "db")
         self.blobs = BlobStore(root / "blobs")
         self.uploads = Uploads()
-        self.reader = ServiceReader(root / "db", self.blobs, self.uploads)
+        self.reader = ServiceReader(root / "db", self.blobs, self.uploads, root)
         self._answered: queue.Queue[Message | None] = queue.Queue()
 
     def page(self, effect: ReadResults | ReadEvaluation | ReadFinished) -> Any:
