@@ -23,10 +23,10 @@ from evopolicy_common.messages.run_settings import RunSettings
 from evopolicy_common.messages.status import StatusRequest
 from evopolicy_common.records.blobs import digest_of
 from evopolicy_common.wire import keys
-from evopolicy_coordinator.cli.status import abandoned
 from evopolicy_coordinator.core.contract.settings import CoreSettings
 from evopolicy_coordinator.core.machine import Core
 from evopolicy_coordinator.server import core_host, process, service
+from evopolicy_coordinator.web.content.remarks import abandoned
 
 
 async def test_all_events_of_a_tick_share_one_write(tmp_path: Path) -> None:
