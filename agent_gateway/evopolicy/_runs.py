@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import html
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,10 +14,11 @@ import msgspec
 from evopolicy._arguments import take
 from evopolicy._records import Records, bars
 from evopolicy_common.errors import DECODE_ERRORS, ConfigError, ProtocolError
-from evopolicy_common.records.run_files import no_run_below, read_record, run_folders, submit_folders
+from evopolicy_common.records.policies.submits import read_submits
+from evopolicy_common.records.run_files import no_run_below, read_record, run_folders
 from evopolicy_common.records.run_record import RunRecord
-from evopolicy_common.records.summary import Summary, decode_summary
-from evopolicy_common.regular_files import open_regular, read_regular
+from evopolicy_common.records.summary import Summary
+from evopolicy_common.regular_files import open_regular
 from evopolicy_gateway.agents.function import RESULT
 
 _MAX_RESULT_BYTES = 1 << 20
@@ -272,15 +273,9 @@ def load_runs(*paths: str | os.PathLike[str]) -> Runs:
 
 def read_run(folder: Path) -> Run:
     """Reads the run in `folder`. Raises ProtocolError or OSError when it holds no finished run."""
-    record = read_record(folder)
-    feedback = folder / "workspace" / "feedback"
-    return Run(folder, record, list(summaries_in(feedback)))
+    return Run(folder, read_record(folder), summaries_of(folder))
 
 
-def summaries_in(feedback: Path) -> Iterator[Summary]:
-    """The readable summaries of a run's submits, in order. Raises ProtocolError for a damaged one."""
-    for folder in submit_folders(feedback).values():
-        try:
-            yield decode_summary(read_regular(folder / "summary.json"))
-        except FileNotFoundError:
-            continue
+def summaries_of(folder: Path) -> list[Summary]:
+    """The summaries of a run's submits, in order. Raises ProtocolError for a damaged one."""
+    return [one.summary for one in read_submits(folder) if one.summary is not None]

@@ -34,9 +34,11 @@ def open_regular(path: Path | str, dir_fd: int | None = None, *, links: bool = F
     return os.fdopen(fd, "rb")
 
 
-def read_regular(path: Path, most: int = MAX_BYTES, *, links: bool = False) -> bytes:
+def read_regular(
+    path: Path | str, most: int = MAX_BYTES, *, dir_fd: int | None = None, links: bool = False
+) -> bytes:
     """The bytes of a file. Raises OSError as `open_regular`, and for one of more than `most` bytes."""
-    with open_regular(path, links=links) as file:
+    with open_regular(path, dir_fd, links=links) as file:
         # The file may have holes, and may grow while it is read.
         size = os.fstat(file.fileno()).st_size
         data = file.read(size + 1) if size <= most else b""

@@ -29,11 +29,11 @@ from evopolicy_results.html.pages import (
     FORMS,
     PlayedEpisode,
     index_page,
-    page,
     replays_page,
     run_title,
     trace_page,
 )
+from evopolicy_results.html.rendering import page
 from evopolicy_results.reading.environments import grouped, names_in_runs, ordered_environments
 from evopolicy_results.reading.parallel import ALONE, Processes
 from evopolicy_results.reading.records import Run, path_text

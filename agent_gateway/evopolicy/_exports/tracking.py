@@ -23,7 +23,7 @@ from urllib.parse import urlsplit
 import msgspec
 
 from evopolicy._exports.tables import time_of
-from evopolicy._runs import summaries_in
+from evopolicy._runs import summaries_of
 from evopolicy_common.errors import DECODE_ERRORS, ConfigError, ProtocolError
 from evopolicy_common.records.blobs import write_atomically
 from evopolicy_common.records.run_files import RUN_JSON, no_run_below, read_record, run_folders
@@ -196,7 +196,7 @@ def _finite(metrics: dict[str, Any]) -> dict[str, float]:
 def _curve(folder: Path) -> Curve:
     try:
         record = read_record(folder) if os.path.lexists(folder / RUN_JSON) else None
-        return Curve(folder, record, list(summaries_in(folder / "workspace" / "feedback")))
+        return Curve(folder, record, summaries_of(folder))
     except (ProtocolError, OSError) as error:
         raise ConfigError(f"{folder}: {error}") from error
 

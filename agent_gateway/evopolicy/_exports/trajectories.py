@@ -24,7 +24,7 @@ from evopolicy._runs import Run, Runs
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.records.episodes.npz import MAX_BYTES, read_arrays
 from evopolicy_common.records.episodes.rendered import MAX_OBSERVATIONS_BYTES, MAX_ROWS_BYTES
-from evopolicy_common.records.run_files import submit_folders
+from evopolicy_common.records.policies.submits import read_submits
 from evopolicy_common.regular_files import open_regular, read_regular
 from evopolicy_common.terminal import say
 
@@ -120,7 +120,7 @@ def _episodes(run: Run, name: str) -> Iterator[tuple[Any, dict[str, Any]]]:
     from minari.data_collector import EpisodeBuffer
 
     returns = {(one.submit, one.episode): one for one in run.episodes if one.split == "train"}
-    folders = submit_folders(run.folder / "workspace" / "feedback")
+    folders = {one.index: one.feedback for one in read_submits(run.folder)}
     for submit in run.submits:
         # Each folder counts, also one whose trajectory was left out.
         for episode, folder in enumerate(sorted((folders[submit.submit] / "episodes").glob("ep_*"))):

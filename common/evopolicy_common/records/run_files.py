@@ -1,4 +1,4 @@
-"""Finds finished runs below folders and the submits of a run's folder, and reads the runs' records.
+"""Finds run directories below folders, and reads the records of finished runs; `policies/submits` reads their submits.
 
 Rule that this module owns: no link is followed below a run directory, which could lead to files of the reader's
 machine.
@@ -7,7 +7,6 @@ machine.
 from __future__ import annotations
 
 import os
-import re
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -17,7 +16,6 @@ from evopolicy_common.errors import ProtocolError
 from evopolicy_common.records.run_record import Artifacts, RunRecord, decode_run_record
 from evopolicy_common.regular_files import read_regular
 
-_SUBMIT = re.compile(r"submit_([0-9]{3,9})")
 RUN_JSON = "run.json"
 _PLACES = ("workspace/feedback", "checkpoints", "logs")
 """Folders of a run directory whose files are read, whatever `run.json` names."""
@@ -79,13 +77,3 @@ def run_folders(paths: Iterable[Path]) -> tuple[list[Path], list[Path]]:
 def no_run_below(*paths: Path) -> str:
     """The text of an error."""
     return f"no run directory at or below {', '.join(map(str, paths))}; name one, or a folder of them, such as runs"
-
-
-def submit_folders(folder: Path) -> dict[int, Path]:
-    """The folders `submit_NNN` in `folder` by index, in order; may be empty. NNN has three digits or more."""
-    if not folder.is_dir() or folder.is_symlink():
-        return {}
-    submits = [(match, child) for child in folder.iterdir() if (match := _SUBMIT.fullmatch(child.name))]
-    # Of several spellings of one index, the shortest. Links are left out.
-    submits.sort(key=lambda each: (int(each[0][1]), -len(each[1].name)))
-    return {int(match[1]): child for match, child in submits if not child.is_symlink()}

@@ -24,6 +24,7 @@ from starlette.responses import HTMLResponse, PlainTextResponse, RedirectRespons
 from starlette.routing import Route
 from starlette.types import ASGIApp
 
+from evopolicy_common.confined import Confined, NotThereError
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.logs import structlog
 from evopolicy_common.messages.status import StatusReply
@@ -33,13 +34,12 @@ from evopolicy_coordinator.server.monitoring.metrics import CONTENT_TYPE, Status
 from evopolicy_coordinator.web.access import Access, Guard
 from evopolicy_coordinator.web.content import rendering
 from evopolicy_coordinator.web.content.cluster import Cluster, set_within
-from evopolicy_coordinator.web.content.confined import Confined, NotThereError
 from evopolicy_coordinator.web.content.feeds import Feeds
 from evopolicy_coordinator.web.content.rendering import Words
 from evopolicy_coordinator.web.content.run_detail import IMAGES, Detail
 from evopolicy_coordinator.web.content.run_folders import Reader, RunFacts, Runs
 from evopolicy_coordinator.web.views.cluster import cluster_view
-from evopolicy_coordinator.web.views.run import episode_values, file_link, run_view, submit_values
+from evopolicy_coordinator.web.views.run import episode_values, file_link, live_run_view, submit_values
 from evopolicy_coordinator.web.views.sweeps import sweeps_view
 
 _FORM_WAIT_S = 10.0
@@ -163,7 +163,7 @@ class Site:
         def view() -> rendering.View:
             run = self.runs.by_key[key]
             retries = () if cluster is None else tuple(cluster.retries.get(run.run, ()))
-            return run_view(run, self.runs, self.reader, words, retries=retries)
+            return live_run_view(run, self.runs, self.reader, words, retries=retries)
 
         return view
 
@@ -201,12 +201,12 @@ class Site:
 
     async def home(self, request: Request) -> Response:
         await self.refresh()
-        return await self.live_page(request, "runs", "runs.html.j2", self.title)
+        return await self.live_page(request, "runs", "runs", self.title)
 
     async def cluster_page(self, request: Request) -> Response:
         await self.refresh()
         title = "Cluster" if self.status is None else f"Cluster {self.status.cluster}"
-        return await self.live_page(request, "cluster", "cluster.html.j2", title)
+        return await self.live_page(request, "cluster", "cluster", title)
 
     async def run_page(self, request: Request) -> Response:
         await self.refresh()
@@ -215,7 +215,14 @@ class Site:
             names = Detail(run.path).replays()
             replays = [(name, file_link(run, f"replays/{name}/video.mp4")) for name in names]
         title = f"{run.entry} on {run.env}"
-        return await self.live_page(request, f"run/{run.key}", "run.html.j2", title, run=run, replays=replays)
+        lead = [f"Run {run.exp_id}", f"repeat {run.repeat}", *filter(None, (run.run, str(run.path or "")))]
+        shown = {
+            "lead": lead,
+            "replays": replays,
+            "back": "/",
+            **dict.fromkeys(("beside", "unplaced", "checkpoints")),
+        }
+        return await self.live_page(request, f"run/{run.key}", "run", title, **shown)
 
     async def events(self, request: Request) -> Response:
         """The updates of one page, as server-sent events."""
@@ -233,16 +240,14 @@ class Site:
         run, index = self._run(request), request.path_params["index"]
         values = await asyncio.to_thread(submit_values, run, self.reader, index)
         title = f"Submit {index} of {run.entry}"
-        return self._page(request, "submit.html.j2", title=title, run=run, **values)
+        return self._page(request, "submit", title=title, run=run, **values)
 
     async def episode_page(self, request: Request) -> Response:
         await self.refresh()
         run, index, episode = self._run(request), request.path_params["index"], request.path_params["episode"]
         values = await asyncio.to_thread(episode_values, run, index, episode)
         title = f"Episode {episode} of submit {index}"
-        return self._page(
-            request, "episode.html.j2", title=title, run=run, index=index, episode=episode, **values
-        )
+        return self._page(request, "episode", title=title, run=run, index=index, episode=episode, **values)
 
     async def file(self, request: Request) -> Response:
         """A file of a run's feedback, or a recording of it once hidden results may be shown."""
@@ -270,9 +275,9 @@ class Site:
 
     async def login(self, request: Request) -> Response:
         if request.method == "GET":
-            return self._page(request, "login.html.j2", title="Sign in", wrong=False)
+            return self._page(request, "login", title="Sign in", wrong=False)
         if not self.access.admits_token((await _form(request)).get("token", "")):
-            return self._page(request, "login.html.j2", 401, title="Sign in", wrong=True)
+            return self._page(request, "login", 401, title="Sign in", wrong=True)
         answer = RedirectResponse("/", 303)
         cookie, secure = self.access.cookie_value, request.url.scheme == "https"
         answer.set_cookie(self.access.cookie, cookie, httponly=True, samesite="strict", secure=secure)
@@ -297,7 +302,7 @@ class Site:
 
     async def _refused(self, request: Request, error: Exception) -> Response:
         status, title, text = error.args if isinstance(error, PageError) else _NOT_THERE
-        return self._page(request, "message.html.j2", status, title=title, text=text, back="/")
+        return self._page(request, "message", status, title=title, text=text, back="/")
 
     def app(self) -> ASGIApp:
         """The application with its guards."""

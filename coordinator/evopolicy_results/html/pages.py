@@ -3,24 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from functools import cache
-from importlib.resources import files
 from typing import Any, NamedTuple
 
-from jinja2 import DictLoader, Environment, StrictUndefined
 from markupsafe import Markup, escape
 
-from evopolicy_common.records import model_calls
-from evopolicy_common.records.policies.trees import changes
+from evopolicy_common.records.policies.submits import read_submits
 from evopolicy_common.records.run_record import Replay
 from evopolicy_common.records.words import in_words
-from evopolicy_results.behaviour.trace import Trace, TraceRow, diff, sources
-from evopolicy_results.figures.plot import Plot, inline_svg
-from evopolicy_results.figures.timelines import Row, timeline_svg
+from evopolicy_common.terminal import number
+from evopolicy_results.behaviour.trace import Trace, diff, sources
+from evopolicy_results.figures.plot import Plot
 from evopolicy_results.html import notice, section, visible
-from evopolicy_results.reading.agent_log import Evidence
+from evopolicy_results.html.rendering import page
+from evopolicy_results.html.run_page import run_view, submit_rows
 from evopolicy_results.reading.environments import grouped, title_of
-from evopolicy_results.reading.records import Run, Submit
+from evopolicy_results.reading.records import Run
 from evopolicy_results.studies.palette import Look
 from evopolicy_results.studies.study import Study
 from evopolicy_results.tables.table import Column, Table, shown
@@ -33,33 +30,6 @@ _LONG = 60
 """Number of characters from which a cell's text is broken into lines."""
 FORMS = (("CSV", "csv"), ("Markdown", "md"), ("LaTeX", "tex"))
 """File forms of a table, with their suffixes."""
-_TEMPLATES = ("base", "macros", "index", "trace", "failed", "replays", "site_bundle", "site_episodes")
-
-
-@cache
-def environment() -> Environment:
-    """The templates of all pages, with autoescaping."""
-    folder = files(__package__).joinpath("templates")
-    names = [f"{name}.html.j2" for name in _TEMPLATES]
-    loader = DictLoader({name: folder.joinpath(name).read_text(encoding="utf-8") for name in names})
-    made = Environment(
-        loader=loader,
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-        finalize=visible,
-    )
-    made.globals["inline"] = lambda plot: Markup(inline_svg(plot.svg, plot.name, plot.alt))
-    made.globals["title_of"] = title_of
-    for name in ("report.css", "report.js"):
-        made.globals[name.split(".")[1]] = Markup(folder.joinpath(name).read_text(encoding="utf-8"))
-    return made
-
-
-def page(template: str, **values: Any) -> str:
-    """A page from the template of that name."""
-    return environment().get_template(f"{template}.html.j2").render(**values)
 
 
 class _Section(NamedTuple):
@@ -294,62 +264,55 @@ def trace_page(
     """One run's page. By submit index, `image_links` has (name, path relative to the page) of its copied images, and
     `videos` the path of its copied feedback video. `beside` lists (agent, look, page) of other agents on the same
     environment."""
-    run, outcome = trace.run, trace.run.record.outcome
-    transitions = [row.transition for row in trace.rows if row.transition is not None]
-    phases = Row(transitions=transitions, budget=run.budget, submits=run.submits)
-    label = f"Code phases of {len(run.submits)} submits over {run.budget} episodes"
-    by_index = {submit.index: submit for submit in run.submits}
-    calls = model_calls.before(run.path, [submit.started_at for submit in run.submits])
-    return page(
-        "trace",
-        title=run_title(run),
-        run=run,
-        closed=in_words(outcome.closed_reason),
+    run, record = trace.run, trace.run.record
+    outcome, best = record.outcome, record.outcome.best_submit_index
+    closed = in_words(outcome.closed_reason)
+    used = run.submits[-1].consumed if run.submits else 0
+    rows = submit_rows(
+        run.submits,
+        {one.index: one.summary for one in read_submits(run.path, record.artifacts)}
+        if not run.is_published
+        else {},
+        traced={row.submit.index: row for row in trace.rows},
+        folder=run.path,
+        selected=best,
+        may_show=True,
+        href="#s{:03d}-source",
+        images=image_links,
+        videos=videos,
+    )
+    view = run_view(
+        rows,
+        entry=run.entry,
+        env=run.env,
         look=look,
-        beside=beside,
         facts=[
             (
                 "held-out mean" if run.rescore is None else f"post hoc mean, {run.rescore.name}",
-                "–" if run.score is None else f"{run.score:.3f}",
+                number(run.score),
             ),
-            ("selected", "–" if outcome.best_submit_index is None else f"s{outcome.best_submit_index:03d}"),
+            ("selected", "–" if best is None else f"s{best:03d}"),
             ("submits", len(run.submits)),
-            ("episodes used", f"{run.submits[-1].consumed if run.submits else 0} of {run.budget}"),
-            ("rejected requests", "–" if run.is_published else len(run.record.rejected_submits)),
+            ("episodes used", f"{used} of {run.budget}"),
+            ("rejected requests", "–" if run.is_published else len(record.rejected_submits)),
         ],
-        timeline=Markup(inline_svg(timeline_svg([phases]), "phases", label) if transitions else ""),
-        has_evidence=any(row.evidence is not None for row in trace.rows),
-        rows=[
-            (
-                row,
-                row.evidence or Evidence(),
-                words,
-                changes(run.path, row.submit.index),
-                _outcome(row, by_index),
-            )
-            for row, words in zip(trace.rows, calls, strict=True)
-        ],
-        image_links=image_links,
-        videos=videos,
+        budget=run.budget,
+        trace=trace,
+    )
+    lead = [f"Run {record.exp_id}", f"repeat {record.repeat}", f"harness {run.harness}"]
+    lead += [f"policy scope {record.experiment_dimensions.policy_scope}"]
+    return page(
+        "run",
+        frame="base.html.j2",
+        view=view,
+        title=run_title(run),
+        back="../index.html",
+        lead=[*lead, *([f"ended by: {closed}"] if closed else [])],
+        beside=beside,
         unplaced=trace.unplaced,
         checkpoints=_checkpoints(trace),
+        replays=[],
     )
-
-
-def _outcome(row: TraceRow, by_index: Mapping[int, Submit]) -> str:
-    submit = row.submit
-    if submit.status != "ok":
-        return f"{in_words(submit.status)}: no working policy"
-    previous = None if row.transition is None else row.transition.previous
-    before = None if previous is None else by_index[previous]
-    parts = []
-    for words, field in (("visible mean", "mean_return"), ("validation mean", "val_mean")):
-        value, earlier = getattr(submit, field), getattr(before, field, None)
-        if value is not None:
-            parts.append(f"{words} {value:.4g}" + ("" if earlier is None else f" ({value - earlier:+.3g})"))
-    if submit.n_failed_episodes:
-        parts.append(f"policy failed in {submit.n_failed_episodes} of {submit.n_episodes} episodes")
-    return "; ".join(parts)
 
 
 def _checkpoints(trace: Trace) -> dict[str, dict[str, Any]]:
@@ -361,7 +324,8 @@ def _checkpoints(trace: Trace) -> dict[str, dict[str, Any]]:
         if texts := sources(trace.run, row.submit):
             same_as = labels.setdefault(repr(sorted(texts.items())), row.submit.label)
             diffs = [] if previous is None else diff(previous, texts)
-            out[row.submit.label] = {"row": row, "same_as": same_as, "diffs": diffs, "texts": texts}
+            edit = "" if row.transition is None else row.transition.edit
+            out[row.submit.label] = {"edit": edit, "same_as": same_as, "diffs": diffs, "texts": texts}
             previous = texts
     return out
 

@@ -62,7 +62,7 @@ def read_summary(path: Path) -> PublishedSummary | None:
     except FileNotFoundError:
         return None
     except (OSError, *DECODE_ERRORS) as error:
-        raise ProtocolError(f"not a submit summary: {error}") from error
+        raise ProtocolError(f"{path.parent.name}/{path.name}: not a submit summary: {error}") from error
 
 
 def read_record(folder: Path, data: bytes) -> RunRecord | None:

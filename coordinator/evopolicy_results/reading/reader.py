@@ -24,9 +24,10 @@ from evopolicy_common.messages.bounds import check_plausible
 from evopolicy_common.messages.environment import Split
 from evopolicy_common.records.aggregates import mean, std
 from evopolicy_common.records.newest import described
-from evopolicy_common.records.policies.checkpoints import CheckpointMeta, bundle_of, read_meta
+from evopolicy_common.records.policies.checkpoints import CheckpointMeta, bundle_of
+from evopolicy_common.records.policies.submits import read_submits
 from evopolicy_common.records.rescores import Rescored, RescoreRecord, read_rescore
-from evopolicy_common.records.run_files import RUN_JSON, check_places, run_folders, submit_folders
+from evopolicy_common.records.run_files import RUN_JSON, check_places, run_folders
 from evopolicy_common.records.run_record import (
     PolicyFailureRecord,
     ReferenceScore,
@@ -34,15 +35,14 @@ from evopolicy_common.records.run_record import (
     decode_run_record,
 )
 from evopolicy_common.records.splits import SPLITS
-from evopolicy_common.records.summary import Summary, decode_summary
 from evopolicy_common.regular_files import read_regular
 from evopolicy_results.code.line_diff import n_changed
 from evopolicy_results.code.sources import reachable_modules, read_python_files, source_digest
 from evopolicy_results.code.topology import describe
 from evopolicy_results.reading import published
 from evopolicy_results.reading.parallel import ALONE, Processes
-from evopolicy_results.reading.published import PUBLISHED, PublishedSummary
-from evopolicy_results.reading.records import LeftOut, Run, Source, Submit, checkpoint_folder
+from evopolicy_results.reading.published import PUBLISHED
+from evopolicy_results.reading.records import LeftOut, Run, Source, Submit
 
 Files = Mapping[str, bytes]
 
@@ -168,7 +168,7 @@ def read_run(folder: Path) -> Run:
 
 def _read_record(folder: Path) -> RunRecord:
     try:
-        with _naming(RUN_JSON):
+        with _reasons(f"{RUN_JSON}: "):
             data = read_regular(folder / RUN_JSON)
             record = published.read_record(folder, data) or decode_run_record(data)
             check_places(folder, record.artifacts)
@@ -180,38 +180,29 @@ def _read_record(folder: Path) -> RunRecord:
 
 
 def _read_submits(folder: Path, record: RunRecord) -> tuple[Submit, ...]:
-    feedback = folder / (record.artifacts.workspace or "workspace") / "feedback"
-    checkpoints = folder / (record.artifacts.checkpoints or "checkpoints")
-    indices = sorted({**submit_folders(feedback), **submit_folders(checkpoints)})
     budget = record.experiment_dimensions.episode_budget
     submits: list[Submit] = []
     previous: Files | None = None
     consumed = 0
-    for index in indices:
-        checkpoint = checkpoint_folder(folder, record.artifacts.checkpoints or "checkpoints", index)
-        shown = checkpoint_folder(feedback.parent, "feedback", index)
-        for place in (checkpoint, shown):
+    for one in read_submits(folder, record.artifacts):
+        index, checkpoint = one.index, one.checkpoint
+        for place in (checkpoint, one.feedback):
             if place.is_symlink():
-                raise UnreadableRunError(
-                    f"{place.relative_to(folder)} is a link; put the folder itself in its place"
-                )
-        summary: Summary | PublishedSummary | None = None
-        if (path := shown / "summary.json").is_file():
-            with _naming(f"{shown.name}/summary.json"):
-                ours = record.record_version != PUBLISHED
-                summary = decode_summary(read_regular(path)) if ours else published.read_summary(path)
-        with _naming(checkpoint.relative_to(folder)):
-            meta = read_meta(checkpoint)
+                name = place.relative_to(folder)
+                raise UnreadableRunError(f"{name} is a link; put the folder itself in its place")
+        with _reasons():
+            is_ours = record.record_version != PUBLISHED
+            summary = one.summary if is_ours else published.read_summary(one.feedback / "summary.json")
+            meta = one.meta
         if summary is not None:
             status: str = summary.status
-            n_episodes, mean = summary.n_episodes, summary.mean_return
-            remaining = summary.remaining_budget
-            after = budget - consumed - n_episodes if remaining is None else remaining
+            n_episodes, mean, remaining = summary.n_episodes, summary.mean_return, summary.remaining_budget
         elif meta is not None:
             status, n_episodes, mean = meta.validation_status, meta.n_episodes_requested, meta.mean_return
-            after = meta.remaining_budget_after
+            remaining = meta.remaining_budget_after
         else:
             raise UnreadableRunError(f"submit {index} has neither summary.json nor _meta.json")
+        after = budget - consumed - n_episodes if remaining is None else remaining
         # The published software gives a folder to some requests that it refuses.
         if status in ("budget_invalid", "invalid_env_instance"):
             continue
@@ -249,12 +240,12 @@ def _bundle_digest(meta: CheckpointMeta | None, checkpoint: Path) -> str:
 
 
 @contextmanager
-def _naming(file: object) -> Iterator[None]:
-    """A damaged file's error names it."""
+def _reasons(name: str = "") -> Iterator[None]:
+    """A damaged file's error is the reason for leaving out its run."""
     try:
         yield
     except ProtocolError as error:
-        raise UnreadableRunError(f"{file}: {error}") from error
+        raise UnreadableRunError(f"{name}{error}") from error
 
 
 _described: dict[str, Source] = {}

@@ -20,10 +20,11 @@ from evopolicy_common.records.aggregates import best_validated, mean, std
 from evopolicy_common.records.journal import Result, SubmitResult
 from evopolicy_common.records.policies import trees
 from evopolicy_common.records.policies.checkpoints import bundle_of
+from evopolicy_common.records.policies.submits import SubmitFiles
 from evopolicy_common.records.rescores import FOLDER, RescoreRecord, read_rescore, rescore_names
 from evopolicy_common.records.run_record import Outcome
 from evopolicy_common.records.summary import Summary
-from evopolicy_results.verify.source import RunUnderTest, SubmitFiles
+from evopolicy_results.verify.source import RunUnderTest
 
 Told = Iterable[tuple[str, Any, Any]]
 """Names of numbers, each with its value and what it has to be."""

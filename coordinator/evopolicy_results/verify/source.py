@@ -14,45 +14,12 @@ import msgspec
 from evopolicy_common.errors import ConfigError, ProtocolError
 from evopolicy_common.messages.environment import Split
 from evopolicy_common.records.newest import described
-from evopolicy_common.records.policies.checkpoints import CheckpointMeta, read_meta
-from evopolicy_common.records.run_files import RUN_JSON, read_record, submit_folders
+from evopolicy_common.records.policies.submits import SubmitFiles, read_submits
+from evopolicy_common.records.run_files import RUN_JSON, read_record
 from evopolicy_common.records.run_record import RunRecord
-from evopolicy_common.records.summary import Summary, decode_summary
-from evopolicy_common.regular_files import read_regular
 from evopolicy_results.evaluations import RANDOM, Cases
 
 _MAX_DIGITS = 9
-
-
-class SubmitFiles(msgspec.Struct, frozen=True, kw_only=True):
-    """A submit's files in the directory."""
-
-    index: int
-    """By the name of its folders."""
-    summary: Summary | None
-    meta: CheckpointMeta | None
-    feedback: Path
-    """`feedback/submit_NNN`, whether or not it exists."""
-    checkpoint: Path
-
-    @property
-    def status(self) -> str:
-        """Its verdict; empty where no file has it."""
-        if self.summary is not None:
-            return self.summary.status
-        return "" if self.meta is None else self.meta.validation_status
-
-    @property
-    def bundle(self) -> str:
-        """Digest of its bundle, from the metadata; empty where they have none."""
-        return "" if self.meta is None else self.meta.bundle
-
-    @property
-    def n_episodes(self) -> int:
-        """Episodes charged."""
-        if self.summary is not None:
-            return self.summary.n_episodes
-        return 0 if self.meta is None else self.meta.n_episodes_requested
 
 
 class EpisodeList(Cases, frozen=True, kw_only=True):
@@ -102,18 +69,12 @@ def read_run(root: Path) -> RunUnderTest:
         ) from error
     except ProtocolError as error:
         raise ConfigError(f"{root / RUN_JSON}: {error}") from error
-    feedback, checkpoints = root / "workspace" / "feedback", root / "checkpoints"
-    folders = {**submit_folders(checkpoints), **submit_folders(feedback)}
-    submits = [
-        SubmitFiles(
-            index=index,
-            summary=_summary(feedback / folder.name),
-            meta=_meta(checkpoints / folder.name, record.experiment_dimensions.episode_budget),
-            feedback=feedback / folder.name,
-            checkpoint=checkpoints / folder.name,
-        )
-        for index, folder in sorted(folders.items())
-    ]
+    try:
+        submits = read_submits(root)
+        for submit in submits:  # a damaged file is an error before anything is played
+            _ = submit.summary, submit.meta
+    except ProtocolError as error:
+        raise ConfigError(f"{root}: {error}") from error
     train = tuple(played for submit in submits if (played := _train(record, submit)))
     hidden = tuple(_hidden(record, {one.submit_index: one for one in train}))
     return RunUnderTest(root=root, record=record, submits=tuple(submits), train=train, hidden=hidden)
@@ -167,20 +128,3 @@ def _hidden(record: RunRecord, train: dict[int, EpisodeList]) -> Iterator[Episod
         if of is not None:
             hidden = {"split": split, "env_instances": tuple(range(n)), "returns": told, "mean": mean}
             yield msgspec.structs.replace(of, **hidden, lengths=None, submit=None, folders=())
-
-
-def _summary(folder: Path) -> Summary | None:
-    path = folder / "summary.json"
-    try:
-        return decode_summary(read_regular(path))
-    except FileNotFoundError:
-        return None
-    except (OSError, ProtocolError) as error:
-        raise ConfigError(f"{path} cannot be read: {error}") from error
-
-
-def _meta(checkpoint: Path, episode_budget: int) -> CheckpointMeta | None:
-    try:
-        return read_meta(checkpoint)
-    except ProtocolError as error:
-        raise ConfigError(f"{checkpoint} is damaged: {error}") from error

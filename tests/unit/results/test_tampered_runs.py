@@ -33,14 +33,14 @@ from invented.run_dirs import write_run
 
 from evopolicy import load_runs as load_public_runs
 from evopolicy._exports import tables, tracking, transcripts
+from evopolicy_common.confined import NotThereError
 from evopolicy_common.errors import ConfigError, EvopolicyError, ProtocolError
 from evopolicy_common.records.episodes import compare
 from evopolicy_common.records.episodes.npz import read_arrays
+from evopolicy_common.records.policies.submits import read_submits
 from evopolicy_common.records.run_difference import differences
-from evopolicy_common.records.run_files import submit_folders
-from evopolicy_common.records.run_record import encode_run_record
+from evopolicy_common.records.run_record import Artifacts, encode_run_record
 from evopolicy_common.regular_files import read_regular
-from evopolicy_coordinator.web.content.confined import NotThereError
 from evopolicy_coordinator.web.content.run_detail import Detail
 from evopolicy_coordinator.web.content.run_folders import Reader
 from evopolicy_gateway.harbor import scores
@@ -299,7 +299,8 @@ def test_of_several_spellings_of_a_submit_the_usual_one_is_read(tmp_path: Path) 
     for name in ("submit_1", "submit_0001", "submit_001", "submit_٣٣٣", "submit_0000000001"):
         (tmp_path / name).mkdir()
     (tmp_path / "submit_002").symlink_to(tmp_path / "submit_001")
-    assert submit_folders(tmp_path) == {1: tmp_path / "submit_001"}
+    found = read_submits(tmp_path.parent, Artifacts(checkpoints=tmp_path.name))
+    assert [one.checkpoint for one in found] == [tmp_path / "submit_001"]
 
 
 def test_an_error_names_the_file_the_reason_and_the_remedy(tmp_path: Path) -> None:

@@ -11,14 +11,12 @@ from typing import Any, TypeVar
 from urllib.parse import urlencode
 
 import msgspec
-from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined
-from markupsafe import Markup
+from jinja2 import ChoiceLoader, Environment, PackageLoader
 
 from evopolicy_common.records.words import in_words
-from evopolicy_common.terminal import counted, duration, number
 from evopolicy_coordinator.web.content.run_folders import key_of
-from evopolicy_results.html import visible
-from evopolicy_results.reading.environments import title_of
+from evopolicy_results.html import rendering as html
+from evopolicy_results.html.rendering import View
 
 T = TypeVar("T")
 
@@ -47,26 +45,16 @@ _PRIORITIES = {
 
 @cache
 def _environment() -> Environment:
-    package = __package__ or ""
-    environment = Environment(
-        loader=ChoiceLoader([PackageLoader(package), PackageLoader("evopolicy_results.html")]),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-        finalize=visible,
-    )
-    environment.filters |= {
-        "number": number,
-        "duration": duration,
+    shared = html.environment()
+    loaders = [PackageLoader(__package__ or ""), PackageLoader("evopolicy_results.html")]
+    own = shared.overlay(loader=ChoiceLoader(loaders))
+    own.filters = {
+        **shared.filters,
         "short": short,
         "state": state_words,
-        "words": in_words,
-        "counted": counted,
         "priority": lambda name: _PRIORITIES.get(name, name),
     }
-    environment.globals["title_of"] = title_of
-    return environment
+    return own
 
 
 @cache
@@ -80,40 +68,15 @@ def static_files() -> dict[str, tuple[bytes, str]]:
 
 
 def part(name: str, /, **values: Any) -> str:
-    """The HTML of one part, by the macro that makes it."""
-    macro = getattr(_environment().get_template("parts.html.j2").module, name)
-    return str(macro(**values))
-
-
-class View:
-    """A page's content at one moment. Every part's HTML is one element whose id is the part's name."""
-
-    def __init__(self, *lists: str) -> None:
-        """`lists`: ids of the elements that hold lists of parts."""
-        self.parts: dict[str, str] = {}
-        self.lists: dict[str, list[str]] = {name: [] for name in lists}
-        """By id of the element that holds them: names of parts, in order."""
-
-    def row(self, of: str, macro: str, ident: str, **values: Any) -> None:
-        """Adds a part, once, to a list."""
-        if ident not in self.parts:
-            self.lists[of].append(ident)
-            self.parts[ident] = part(macro, ident=ident, **values)
+    """The HTML of one part, by the macro that makes it: here, or among those of a run's page."""
+    macro = getattr(_environment().get_template("parts.html.j2").module, name, None)
+    return html.part(name, **values) if macro is None else str(macro(**values))
 
 
 def page(template: str, *, view: View | None = None, live: str = "", cursor: str = "", **values: Any) -> str:
-    """A whole page. In it `part(name)` and `listed(name)` put the view's parts; `live` is where its updates come
-    from."""
-    shown = view or View()
-
-    def one(name: str) -> Markup:
-        return Markup(shown.parts[name])
-
-    def listed(name: str) -> Markup:
-        return Markup("".join(shown.parts[each] for each in shown.lists[name]))
-
-    made = _environment().get_template(template)
-    return made.render(part=one, listed=listed, live=live, cursor=cursor, **values)
+    """A whole page; `live` is where its updates come from."""
+    own = _environment()
+    return html.page(template, view=view, own=own, live=live, cursor=cursor, frame="web.html.j2", **values)
 
 
 def short(value: float) -> str:

@@ -18,6 +18,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
+from evopolicy_common.confined import Confined, NotThereError
 from evopolicy_common.errors import DECODE_ERRORS, BundleError
 from evopolicy_common.messages.bounds import LARGEST
 from evopolicy_common.records import open_run
@@ -29,8 +30,7 @@ from evopolicy_common.records.policies import bundles
 from evopolicy_common.records.policies.checkpoints import METADATA
 from evopolicy_common.records.words import in_words
 from evopolicy_common.terminal import event_text
-from evopolicy_coordinator.web.content.charts import Line
-from evopolicy_coordinator.web.content.confined import Confined, NotThereError
+from evopolicy_results.figures.line_chart import Line
 
 MAX_TEXT = 256 << 10
 """Characters of one file, or of one text, that are shown."""

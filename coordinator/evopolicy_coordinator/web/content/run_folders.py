@@ -18,17 +18,18 @@ from typing import Any, NamedTuple, TypeVar
 
 import msgspec
 
+from evopolicy_common.confined import MAX_NAMES, Confined
 from evopolicy_common.errors import DECODE_ERRORS, ProtocolError
 from evopolicy_common.messages.run_settings import Start
 from evopolicy_common.messages.status import RunStatus
 from evopolicy_common.records import open_run
 from evopolicy_common.records.open_run import IntendedRun, OpenedRun
+from evopolicy_common.records.policies.submits import read_submits
 from evopolicy_common.records.run_files import RUN_JSON, read_record
 from evopolicy_common.records.suite_folder import INDEX, PAUSED, Entry, Index
-from evopolicy_common.records.summary import Summary, decode_summary
+from evopolicy_common.records.summary import Summary
 from evopolicy_common.regular_files import read_regular
 from evopolicy_coordinator.core.contract.records import shared
-from evopolicy_coordinator.web.content.confined import Confined
 from evopolicy_results.reading.environments import learn_names
 from evopolicy_results.reading.reader import find_run_dirs
 
@@ -93,6 +94,8 @@ class RunFacts(msgspec.Struct, frozen=True, kw_only=True):
     random: float | None = None
     """Uniform random actions on the same hidden cases."""
     finished: bool = False
+    stamp: tuple[int, int] = (0, 0)
+    """Time and size of a finished run's record."""
     start: Start | None = None
     """The submit from which it starts. `parent_scored` is known of a finished run only."""
     replay_of: str = ""
@@ -137,6 +140,11 @@ class Runs(msgspec.Struct, frozen=True, kw_only=True):
     origins: frozenset[str] = frozenset()
     """Ids of runs that a run whose agent may be alive plays again or comes from."""
 
+    @property
+    def entries(self) -> list[str]:
+        """The agents; each has one look on all pages."""
+        return sorted({run.entry for run in self.by_key.values()})
+
     def of(self, name: str) -> RunFacts | None:
         """The run with this id of the cluster; None if it is not here. A replay has an id of its own."""
         return next((run for run in self.by_key.values() if run.run == name), None)
@@ -161,7 +169,7 @@ class Reader:
     def __init__(self, roots: Sequence[Path]) -> None:
         self.roots = tuple(root.resolve() for root in roots)
         self._records: dict[Path, tuple[tuple[int, int], RunFacts]] = {}
-        self._submits: dict[Path, dict[str, Summary]] = {}
+        self._submits: dict[Path, dict[int, Summary]] = {}
 
     def read(self, cluster: Sequence[RunStatus] | None, *, cluster_is_known: bool) -> Runs:
         """All runs as they are now. `cluster`: its unfinished runs; `cluster_is_known` False: it should be asked and
@@ -214,20 +222,16 @@ class Reader:
         stamp = (info.st_mtime_ns, info.st_size)
         known = self._records.get(folder)
         if known is None or known[0] != stamp:
-            known = self._records[folder] = stamp, _finished(folder)
+            known = self._records[folder] = stamp, msgspec.structs.replace(_finished(folder), stamp=stamp)
         return known[1] if entry is None else msgspec.structs.replace(known[1], repeat=entry.repeat)
 
     def submits(self, folder: Path) -> list[Submit]:
         """The submits of a run, in order; each summary is read once."""
-        confined = Confined(folder)
         known = self._submits.setdefault(folder, {})
-        for name in confined.names("workspace/feedback"):
-            index = name.name.removeprefix("submit_")
-            if name.name in known or index == name.name or not index.isdecimal():
-                continue
-            data = confined.read(f"workspace/feedback/{name.name}/summary.json", _MAX_SUMMARY_BYTES)
+        for one in read_submits(folder, names=MAX_NAMES, size=_MAX_SUMMARY_BYTES):
             with contextlib.suppress(ProtocolError):
-                known[name.name] = msgspec.structs.replace(decode_summary(data), **dict.fromkeys(_BY_EPISODE))
+                if one.index not in known and one.summary is not None:
+                    known[one.index] = msgspec.structs.replace(one.summary, **dict.fromkeys(_BY_EPISODE))
         summaries = sorted(known.values(), key=lambda each: each.submit_index)
         consumed = itertools.accumulate(each.n_episodes for each in summaries)
         return list(map(Submit, summaries, consumed))

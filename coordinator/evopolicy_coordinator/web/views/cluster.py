@@ -14,11 +14,11 @@ from markupsafe import Markup
 from evopolicy_common.cli.conventions import bytes_text
 from evopolicy_common.messages.status import DiskUse, StatusReply, WorkerStatus
 from evopolicy_common.terminal import duration
-from evopolicy_coordinator.web.content.charts import Line, chart
 from evopolicy_coordinator.web.content.cluster import Cluster
 from evopolicy_coordinator.web.content.remarks import remarks
 from evopolicy_coordinator.web.content.rendering import PAGE_ROWS, View, Words, ident, paged, part, short
 from evopolicy_coordinator.web.content.run_folders import RunFacts, Runs
+from evopolicy_results.figures.line_chart import Line, chart
 from evopolicy_results.html import notice
 from evopolicy_results.reading.environments import title_of
 
@@ -56,10 +56,11 @@ def cluster_view(cluster: Cluster, words: Words, runs: Runs, roots: Sequence[Pat
     for worker in shown:
         plays = _plays(worker, names, by_run)
         ident_of = ident("worker", worker.worker)
-        view.row("worker-rows", "worker_row", ident_of, worker=worker, plays=plays)
+        view.row("worker-rows", ident_of, part("worker_row", ident=ident_of, worker=worker, plays=plays))
     for run in status.runs[:PAGE_ROWS]:
         key = by_run[run.run].key if run.run in by_run else ""
-        view.row("open-rows", "open_row", ident("open", run.run), run=run, key=key)
+        name = ident("open", run.run)
+        view.row("open-rows", name, part("open_row", ident=name, run=run, key=key))
     return view
 
 

@@ -3,35 +3,35 @@
 from __future__ import annotations
 
 import itertools
-import math
 from collections.abc import Iterable, Iterator, Sequence
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlencode
 
 from markupsafe import Markup
 
+from evopolicy_common.confined import NotThereError
 from evopolicy_common.messages.status import RetriedJobs
 from evopolicy_common.records import model_calls
 from evopolicy_common.records.policies.trees import changes
 from evopolicy_common.records.summary import utc_text
 from evopolicy_common.terminal import counted, duration, number
-from evopolicy_coordinator.web.content.charts import Line, chart
-from evopolicy_coordinator.web.content.confined import NotThereError
 from evopolicy_coordinator.web.content.rendering import View, Words, ident, part, short, state_words
 from evopolicy_coordinator.web.content.run_detail import IMAGES, MAX_WORDS, CodeFile, Detail, Happened
 from evopolicy_coordinator.web.content.run_folders import Reader, RunFacts, Runs, Submit
-from evopolicy_results.behaviour.trace import diff
+from evopolicy_results.behaviour.trace import Trace, diff, trace
+from evopolicy_results.figures.line_chart import chart
 from evopolicy_results.html import notice
-from evopolicy_results.reading.environments import title_of
+from evopolicy_results.html.run_page import run_view, submit_rows
+from evopolicy_results.reading.reader import read_run
+from evopolicy_results.reading.records import Submit as Shown
 from evopolicy_results.studies.palette import looks
 
-MAX_SUBMITS = 200
-"""Submits that a run's page lists, the newest."""
 MAX_EPISODES = 256
 
 
-def run_view(
+def live_run_view(
     run: RunFacts,
     runs: Runs,
     reader: Reader,
@@ -40,44 +40,70 @@ def run_view(
     retries: Sequence[RetriedJobs] = (),
 ) -> View:
     """One run: curve, submits, words, events. `retries`: the jobs of it that the cluster has played again."""
-    may_show = runs.may_show(run)
-    look = looks([run.entry], None)[run.entry]
-    submits = [] if run.path is None else reader.submits(run.path)
-    detail = None if run.path is None else Detail(run.path)
-    reference = ("random, held-out", run.random) if may_show and run.random is not None else None
-    parent = runs.of(run.start.run) if run.start else None
-    view = View("submit-rows", "messages", "events")
+    may_show, path = runs.may_show(run), run.path
+    known = [] if path is None else reader.submits(path)
+    traced = _traced(path, run.stamp) if path is not None and run.finished else None
+    rows = submit_rows(
+        [_submit(each) for each in known] if traced is None else traced.run.submits,
+        {each.summary.submit_index: each.summary for each in known},
+        traced=None if traced is None else {row.submit.index: row for row in traced.rows},
+        folder=path if run.finished else None,
+        selected=None if traced is None else traced.run.record.outcome.best_submit_index,
+        may_show=may_show,
+        href=f"/run/{run.key}/submit/{{}}",
+    )
+    view = run_view(
+        rows,
+        entry=run.entry,
+        env=run.env,
+        look=looks(runs.entries, None).get(run.entry),
+        facts=_run_facts(run, may_show),
+        notices=_one_run_notices(run, may_show),
+        budget=run.budget or 0,
+        reference=("random, held-out", run.random) if may_show and run.random is not None else None,
+        is_finished=run.finished,
+        trace=traced if may_show else None,
+        lists=("messages", "events"),
+    )
+    detail = None if path is None else Detail(path)
     messages = [] if detail is None else detail.messages(words.before)
     earlier = words.link(before=messages[0].at) if messages and messages[0].at > 0 else ""
-    latest = words.before is not None
+    latest, parent = words.before is not None, runs.of(run.start.run) if run.start else None
     view.parts |= {
-        "facts": part("facts", facts=_run_facts(run, may_show)),
         "lineage": part("lineage", run=run, parent=parent, original=runs.of(run.replay_of)),
-        "notices": part("notices", notices=_one_run_notices(run, may_show)),
-        "curve": part(
-            "figure",
-            ident="curve",
-            svg=Markup(_curve(submits, run, reference)),
-            empty="No submit was ok." if run.finished else "No submit has a verdict yet.",
-            title="Train returns over budget",
-            caption="Mean visible train return of every ok submit, and the best so far.",
-        ),
         "messages-more": part("messages_more", earlier=earlier, latest=latest, n=len(messages)),
-        "look": part("identity", run=run, look=look, env_title=title_of(run.env)),
     }
-    means = [-math.inf if submit.mean is None else submit.mean for submit in submits]
-    before = itertools.accumulate(means, max, initial=-math.inf)
-    rises = [mean > best for mean, best in zip(means, before, strict=False)]
-    for submit, rise in list(zip(submits, rises, strict=True))[::-1][:MAX_SUBMITS]:
-        shown = {"submit": submit.summary, "consumed": submit.consumed, "best": rise}
-        name = f"submit-{submit.summary.submit_index}"
-        view.row("submit-rows", "submit_row", name, key=run.key, **shown)
     for one in messages:
-        view.row("messages", "message", f"message-{one.at}", one=one)
+        name = f"message-{one.at}"
+        view.row("messages", name, part("message", ident=name, one=one))
     events = [*([] if detail is None else detail.happened()), *map(_retried, retries)]
     for event in sorted(events, key=lambda each: each.at, reverse=True)[:MAX_WORDS]:
-        view.row("events", "event", ident("event", event.at, event.text), one=event)
+        name = ident("event", event.at, event.text)
+        view.row("events", name, part("event", ident=name, one=event))
     return view
+
+
+@lru_cache(maxsize=8)
+def _traced(folder: Path, stamp: tuple[int, int]) -> Trace | None:
+    """A finished run as a report reads it; None for one that a report leaves out. `stamp`: of its record."""
+    try:
+        return trace(read_run(folder))
+    except Exception:  # an agent wrote the files; the rows then have what their summaries have
+        return None
+
+
+def _submit(one: Submit) -> Shown:
+    summary = one.summary
+    return Shown(
+        index=summary.submit_index,
+        status=summary.status,
+        n_episodes=summary.n_episodes,
+        consumed_before=one.consumed - summary.n_episodes,
+        consumed=one.consumed,
+        mean_return=one.mean,
+        n_failed_episodes=len(summary.errors or ()),
+        started_at=summary.submit_started_at,
+    )
 
 
 def _retried(one: RetriedJobs) -> Happened:
@@ -128,15 +154,6 @@ def _one_run_notices(run: RunFacts, may_show: bool) -> list[dict[str, Any]]:
     return notices
 
 
-def _curve(submits: Sequence[Submit], run: RunFacts, reference: tuple[str, float] | None) -> str:
-    points = [(float(each.consumed), mean) for each in submits if (mean := each.mean) is not None]
-    best = itertools.accumulate((mean for _, mean in points), max)
-    rising = [(at, mean) for (at, _), mean in zip(points, best, strict=True)]
-    lines = [Line("mean train return", points, dots=True), Line("best so far", rising, steps=True)]
-    title, x_title, x_max = "Train returns over budget", "train episodes consumed", float(run.budget or 0)
-    return chart(title, x_title, lines, height=240.0, x_max=x_max, reference=reference)
-
-
 def submit_values(run: RunFacts, reader: Reader, index: int) -> dict[str, Any]:
     """The parts of one submit's page. NotThereError for a submit that is unknown or has no verdict yet."""
     submits = {one.summary.submit_index: one for one in (reader.submits(run.path) if run.path else ())}
@@ -169,8 +186,8 @@ def submit_values(run: RunFacts, reader: Reader, index: int) -> dict[str, Any]:
         "consumed": submit.consumed,
         "previous": index - 1 if index - 1 in submits else None,
         "next": index + 1 if index + 1 in submits else None,
-        "diffs": _diffs(previous, code) if previous else [],
-        "files": code,
+        "diffs": diff(_texts(previous), _texts(code)) if previous else [],
+        "files": [(file.path, file.text) for file in code],
         "calls": model_calls.before(run.path, starts)[-1],
         "workspace": changes(run.path, index),
         "episodes": episodes,
@@ -183,14 +200,8 @@ def _numbers(value: Any) -> list[float | None]:
     return [each if isinstance(each, int | float) else None for each in values]
 
 
-def _diffs(before: Iterable[CodeFile], after: Iterable[CodeFile]) -> list[dict[str, Any]]:
-    old = {file.path: file.text for file in before if file.text is not None}
-    new = {file.path: file.text for file in after if file.text is not None}
-    kinds = {"+": "ins", "-": "del", "@": "hunk"}
-    return [
-        {"path": one.path, "cut": one.cut, "lines": [(kinds.get(line[:1], ""), line) for line in one.lines]}
-        for one in diff(old, new)
-    ]
+def _texts(files: Iterable[CodeFile]) -> dict[str, str]:
+    return {file.path: file.text for file in files if file.text is not None}
 
 
 def file_link(run: RunFacts, path: str) -> str:

@@ -34,13 +34,13 @@ _TROUBLED = ("error", "unreadable", "no_ok_submit", "cancelled", "interrupted")
 def sweeps_view(runs: Runs, cluster: Cluster | None, words: Words, roots: Sequence[Path]) -> View:
     """All runs: a matrix for each sweep, and one table."""
     every = [run for sweep in runs.sweeps for run in sweep.runs]
-    agents = looks(sorted({run.entry for run in every}), None)
+    agents = looks(runs.entries, None)
     view = View("matrices", "run-rows")
     cells = MAX_CELLS
     for sweep in runs.sweeps:
         name = ident("sweep", str(sweep.root))
         matrix, cells = _matrix(sweep, runs, agents, cells)
-        view.row("matrices", "matrix", name, **matrix)
+        view.row("matrices", name, part("matrix", ident=name, **matrix))
     shown, pages = paged(sorted(every, key=_order), words, _row_texts)
     view.parts |= {
         "facts": part("facts", facts=_sweep_facts(every)),
@@ -51,8 +51,8 @@ def sweeps_view(runs: Runs, cluster: Cluster | None, words: Words, roots: Sequen
         may_show = runs.may_show(run)
         score, random = (run.score, run.random) if may_show else (None, None)
         about = {"run": run, "look": agents[run.entry], "score": score, "random": random}
-        hidden = run.finished and not may_show and run.state == "completed"
-        view.row("run-rows", "run_row", ident("row", run.key), hidden=hidden, **about)
+        hidden, name = run.finished and not may_show and run.state == "completed", ident("row", run.key)
+        view.row("run-rows", name, part("run_row", ident=name, hidden=hidden, **about))
     return view
 
 

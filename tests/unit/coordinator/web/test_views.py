@@ -14,9 +14,9 @@ from invented.web_site import client, finished_run, open_run, open_status, site_
 
 from evopolicy_common.messages.run_settings import Start
 from evopolicy_common.messages.status import DiskUse, QueuedJobs, RetriedJobs, WorkerStatus
-from evopolicy_coordinator.web.content.charts import Line, chart
 from evopolicy_coordinator.web.content.cluster import _RETRIES_OF_A_RUN
 from evopolicy_coordinator.web.content.run_folders import key_of
+from evopolicy_results.figures.line_chart import Line, chart
 
 LOST = RetriedJobs(at=1_767_312_000.0, worker="w-attic", failure="worker_lost", jobs=3)
 FAILED = RetriedJobs(at=1_767_312_060.0, worker="w-cellar", failure="failed")

@@ -1,0 +1,182 @@
+"""The page of one run, in a report and in the live view: a row for each submit, with what its agent read and said
+before it, what it changed, and what came of it."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import msgspec
+from markupsafe import Markup
+
+from evopolicy_common.records import model_calls
+from evopolicy_common.records.policies.trees import changes
+from evopolicy_results.behaviour.trace import Trace, TraceRow
+from evopolicy_results.figures.line_chart import Line, chart
+from evopolicy_results.figures.plot import inline_svg
+from evopolicy_results.figures.timelines import Row, timeline_svg
+from evopolicy_results.html.rendering import View, part
+from evopolicy_results.reading.agent_log import Evidence
+from evopolicy_results.reading.environments import title_of
+from evopolicy_results.reading.records import Submit
+from evopolicy_results.studies.palette import Look
+
+MAX_SUBMITS = 200
+"""Submits that a page of the live view lists, the newest."""
+
+
+class SubmitRow(msgspec.Struct, frozen=True, kw_only=True):
+    """One submit as its row shows it."""
+
+    submit: Submit
+    summary: Any
+    """Its summary, the published software's too; None without one."""
+    is_best: bool
+    """Whether no other submit has a higher mean train return; one submit at most."""
+    is_selected: bool
+    outcome: str
+    """Hidden results, in words; empty where they may not be shown."""
+    change: str = ""
+    """What changed, in words."""
+    edit: str = ""
+    evidence: Evidence = Evidence()
+    href: str = ""
+    """The submit's code."""
+    images: Sequence[tuple[str, str]] = ()
+    """Names and addresses."""
+    video: str = ""
+
+
+def submit_rows(
+    submits: Sequence[Submit],
+    summaries: Mapping[int, Any],
+    *,
+    traced: Mapping[int, TraceRow] | None = None,
+    folder: Path | None = None,
+    selected: int | None = None,
+    may_show: bool = False,
+    href: str = "{}",
+    images: Mapping[int, Sequence[tuple[str, str]]] | None = None,
+    videos: Mapping[int, str] | None = None,
+) -> list[SubmitRow]:
+    """The rows in order. `traced` and `folder`: of a finished run; `may_show`: whether its hidden results may be shown;
+    `href`: the address of a submit's code, with `{}` for its index."""
+    known, by_index = traced or {}, {submit.index: submit for submit in submits}
+    means = [(submit.mean_return, -submit.index) for submit in submits if submit.status == "ok"]
+    best = max(((mean, index) for mean, index in means if mean is not None), default=(0.0, 1))[1]
+    starts = [submit.started_at for submit in submits]
+    calls = [""] * len(submits) if folder is None else model_calls.before(folder, starts)
+    rows: list[SubmitRow] = []
+    for submit, words in zip(submits, calls, strict=True):
+        row, index = known.get(submit.index), submit.index
+        other = "" if folder is None else changes(folder, index)
+        texts = [_change(row) if row else "", f"workspace: {other}" if other else "", words]
+        rows.append(
+            SubmitRow(
+                submit=submit,
+                summary=summaries.get(index),
+                is_best=index == -best,
+                is_selected=may_show and index == selected,
+                outcome=_outcome(row, by_index) if row is not None and may_show else "",
+                change="; ".join(filter(None, texts)),
+                edit=row.transition.edit if row is not None and row.transition is not None else "",
+                evidence=(row.evidence if row is not None else None) or Evidence(),
+                href=href.format(index),
+                images=(images or {}).get(index, ()),
+                video=(videos or {}).get(index, ""),
+            )
+        )
+    return rows
+
+
+def _change(row: TraceRow) -> str:
+    edit = "" if row.transition is None else row.transition.edit
+    lines = row.submit.changed_lines
+    changed = "" if lines is None else f"{lines} line{'' if lines == 1 else 's'} changed"
+    if edit == "rollback" and row.transition is not None:
+        return f"to the topology of s{row.transition.back_to:03d}, {changed}"
+    return {"retest": "same bytes", "data": "other files of system/ than the source bundle"}.get(
+        edit, changed
+    )
+
+
+def _outcome(row: TraceRow, by_index: Mapping[int, Submit]) -> str:
+    value, transition = row.submit.val_mean, row.transition
+    if value is None:
+        return ""
+    before = (
+        None if transition is None or transition.previous is None else by_index[transition.previous].val_mean
+    )
+    change = "" if before is None else f" ({value - before:+.3g})"
+    best = ", the highest so far" if transition is not None and transition.hit else ""
+    return f"validation mean {value:.4g}{change}{best}"
+
+
+def run_view(
+    rows: Sequence[SubmitRow],
+    *,
+    entry: str,
+    env: str,
+    look: Look | None,
+    facts: Iterable[tuple[str, Any]],
+    notices: Sequence[Mapping[str, Any]] = (),
+    budget: int = 0,
+    reference: tuple[str, float] | None = None,
+    is_finished: bool = True,
+    trace: Trace | None = None,
+    lists: Sequence[str] = (),
+) -> View:
+    """The parts that the page has in a report and in the live view. `lists`: of further parts."""
+    view = View("submit-rows", *lists)
+    view.parts |= {
+        "look": part("identity", entry=entry, look=look, env_title=title_of(env)),
+        "facts": part("facts", facts=facts),
+        "notices": part("notices", notices=notices),
+        "curve": part(
+            "figure",
+            ident="curve",
+            svg=Markup(_curve(rows, budget, reference)),
+            empty="No submit was ok." if is_finished else "No submit has a verdict yet.",
+            title="Train returns over budget",
+            caption="Mean train return of every ok submit, and the best so far.",
+        ),
+    }
+    transitions = (
+        [] if trace is None else [row.transition for row in trace.rows if row.transition is not None]
+    )
+    if trace is not None and transitions:
+        submits, budget = trace.run.submits, trace.run.budget
+        phases = Row(transitions=transitions, budget=budget, submits=submits)
+        label = f"Code phases of {len(submits)} submits over {budget} episodes"
+        view.parts["phases"] = part(
+            "figure",
+            ident="phases",
+            svg=Markup(inline_svg(timeline_svg([phases]), "phases", label)),
+            empty="",
+            title="Code phases",
+            caption=f"Edit types over the {budget} train episodes. A mark stands where its submit's episodes end.",
+        )
+    has_evidence = any(row.evidence.read or row.evidence.messages for row in rows)
+    view.parts["submits-head"] = part("submits_head", has_evidence=has_evidence)
+    for row in rows[::-1][:MAX_SUBMITS] if not is_finished else rows:
+        ident = f"submit-{row.submit.index}"
+        view.row("submit-rows", ident, part("submit_row", ident=ident, row=row, has_evidence=has_evidence))
+    return view
+
+
+def _curve(rows: Sequence[SubmitRow], budget: int, reference: tuple[str, float] | None) -> str:
+    ok = [row.submit for row in rows if row.submit.status == "ok"]
+    points = [(float(one.consumed), one.mean_return) for one in ok if one.mean_return is not None]
+    best = itertools.accumulate((mean for _, mean in points), max)
+    rising = [(at, mean) for (at, _), mean in zip(points, best, strict=True)]
+    lines = [Line("mean train return", points, dots=True), Line("best so far", rising, steps=True)]
+    return chart(
+        "Train returns over budget",
+        "train episodes used",
+        lines,
+        height=240.0,
+        x_max=float(budget),
+        reference=reference,
+    )
