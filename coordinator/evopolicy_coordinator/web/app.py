@@ -41,6 +41,7 @@ from evopolicy_coordinator.web.content.run_folders import Reader, RunFacts, Runs
 from evopolicy_coordinator.web.views.cluster import cluster_view
 from evopolicy_coordinator.web.views.run import episode_values, file_link, live_run_view, submit_values
 from evopolicy_coordinator.web.views.sweeps import sweeps_view
+from evopolicy_results.html.rendering import View
 
 _FORM_WAIT_S = 10.0
 _SCAN_S = 1.0
@@ -149,7 +150,7 @@ class Site:
 
     # ---- views by page ----
 
-    def view_of(self, page: str, words: Words) -> Callable[[], rendering.View]:
+    def view_of(self, page: str, words: Words) -> Callable[[], View]:
         """The function that makes the parts of a page. NotThereError for an unknown page."""
         cluster = self.cluster
         if page == "runs":
@@ -160,7 +161,7 @@ class Site:
         if kind != "run" or key not in self.runs.by_key:
             raise NotThereError(page)
 
-        def view() -> rendering.View:
+        def view() -> View:
             run = self.runs.by_key[key]
             retries = () if cluster is None else tuple(cluster.retries.get(run.run, ()))
             return live_run_view(run, self.runs, self.reader, words, retries=retries)

@@ -23,6 +23,7 @@ _OF_SUITE = (
 )
 """All but the second average over environments."""
 _OF_STUDY = (
+    "scores.overview",
     "scores.worlds",
     "policies.hit_rates",
     "policies.edit_size",

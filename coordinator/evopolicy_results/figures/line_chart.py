@@ -23,6 +23,8 @@ class Line(NamedTuple):
     dots: bool = False
     steps: bool = False
     """Whether a value holds until the next one."""
+    colour: str = ""
+    """Instead of that of its place; such a line with steps is dashed."""
 
 
 def chart(
@@ -77,7 +79,7 @@ def chart(
             f' 3"><title>{escape(name)}: {level:.4g}</title></path>'
         )
     for place, line in enumerate(lines):
-        colour, dash = COLOURS[place % len(COLOURS)], _DASHES[place // len(COLOURS) % len(_DASHES)]
+        colour, dash = _stroke(place, line)
         path = _path(line, x, y)
         out.append(
             f'<path d="{path}" fill="none" stroke="{colour}" stroke-width="1.6"'
@@ -98,7 +100,10 @@ def chart(
 
 
 def _legend(lines: Sequence[Line], reference: tuple[str, float] | None) -> str:
-    strokes = [(line.name, f'"{COLOURS[place % len(COLOURS)]}"') for place, line in enumerate(lines)]
+    strokes = []
+    for place, line in enumerate(lines):
+        colour, dash = _stroke(place, line)
+        strokes.append((line.name, f'"{colour}"' + (' stroke-dasharray="4 2"' if dash else "")))
     if reference is not None:
         strokes.append((reference[0], f'"{REFERENCE}" stroke-dasharray="4 2"'))
     items = (
@@ -107,6 +112,13 @@ def _legend(lines: Sequence[Line], reference: tuple[str, float] | None) -> str:
         for name, stroke in strokes
     )
     return f'<ul class="legend">{"".join(items)}</ul>'
+
+
+def _stroke(place: int, line: Line) -> tuple[str, str]:
+    """Colour and dash."""
+    if line.colour:
+        return line.colour, _DASHES[1] if line.steps else ""
+    return COLOURS[place % len(COLOURS)], _DASHES[place // len(COLOURS) % len(_DASHES)]
 
 
 def _path(line: Line, x: Callable[[float], float], y: Callable[[float], float]) -> str:

@@ -6,6 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from itertools import zip_longest
 from statistics import fmean
+from typing import Any
 
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
@@ -14,16 +15,77 @@ from evopolicy_common.statistics.intervals import Estimate
 from evopolicy_results.behaviour.edits import demand_of
 from evopolicy_results.figures.plot import GRID, INK, Plot
 from evopolicy_results.figures.style import handles_of, legend_above, name_rows, new_figure, write_beside
-from evopolicy_results.reading.environments import family_of, family_title, grouped, title_of
+from evopolicy_results.reading.environments import (
+    family_of,
+    family_title,
+    grouped,
+    ordered_environments,
+    title_of,
+)
 from evopolicy_results.reading.records import rows
 from evopolicy_results.scoring.evolution import Evolution, best_at
-from evopolicy_results.scoring.scores import DEMANDS
+from evopolicy_results.scoring.scores import DEMANDS, scales_of
 from evopolicy_results.statistics.aggregates import TAUS, Bounded
 from evopolicy_results.studies.palette import REFERENCE, Look
 from evopolicy_results.studies.study import Study, Suite
 
 MAX_CURVES = 3
 """Maximum number of runs of one agent on one environment drawn separately; more are drawn as their mean and range."""
+
+
+def overview(study: Study, looks: Mapping[str, Look]) -> Plot | None:
+    """Each agent's held-out mean on each environment between random actions (0) and the best agent (1), by family."""
+    points: dict[str, list[dict[str, Any]]] = {}
+    for suite in study.suites:
+        for env, scale in scales_of(suite.table).items():
+            width = scale.best - scale.random
+            for agent in suite.table.agents:
+                estimate = suite.statistics.means.get((agent, env))
+                if estimate is not None:
+                    ends = _ends(estimate)
+                    value, low, high = ((each - scale.random) / width for each in (estimate.value, *ends))
+                    known = {"env": env, "entry": agent, "value": value, "low": low, "high": high}
+                    points.setdefault(env, []).append(known)
+    if not points:
+        return None
+    families = grouped(ordered_environments(points), family_of)
+    lines = [line for family, envs in families.items() for line in (f"{family_title(family)}:", *envs)]
+    entries = [
+        entry for entry in looks if any(entry == one["entry"] for each in points.values() for one in each)
+    ]
+    step = min(0.22, 0.8 / max(1, len(entries)))
+    height = 1.1 + sum(0.26 if line not in points else 0.16 + 0.13 * len(entries) for line in lines)
+    names = [title_of(line) if line in points else line for line in lines]
+    with new_figure(4.8, height, names=names) as (figure, axes):
+        panel = axes[0][0]
+        for place, line in enumerate(lines):
+            panel.axhline(place - 0.5, color=GRID, linewidth=0.6)
+            for one in points.get(line, ()):
+                look, shift = (
+                    looks[one["entry"]],
+                    step * (entries.index(one["entry"]) - (len(entries) - 1) / 2.0),
+                )
+                panel.hlines(
+                    place + shift, one["low"], one["high"], color=look.colour, linewidth=1.3, alpha=0.7
+                )
+                panel.plot(one["value"], place + shift, look.marker, color=look.colour, markersize=5.0)
+        for label, line in zip(panel.get_yticklabels(), lines, strict=True):
+            label.set_fontweight("normal" if line in points else "bold")
+        panel.set_xlim(-0.25, 1.25)
+        panel.set_xticks([0.0, 0.5, 1.0], ["random", "0.5", "best agent"])
+        legend_above(figure, handles_of(entries, looks))
+    missing = [
+        title_of(env) for suite in study.suites for env in suite.table.environments if env not in points
+    ]
+    return Plot(
+        name="overview",
+        title="Score by environment",
+        caption="Held-out mean and 95 % interval, on each environment's scale from random actions to the best agent."
+        + (f" Without a scale, as no agent beats random actions: {', '.join(missing)}." if missing else ""),
+        alt=f"Scores of {len(entries)} agents on {len(points)} environments between random actions and the best agent.",
+        data=[one for each in points.values() for one in each],
+        figure=figure,
+    )
 
 
 def rank_scores(suite: Suite, study: Study, looks: Mapping[str, Look]) -> Plot | None:

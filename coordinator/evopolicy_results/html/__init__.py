@@ -18,8 +18,9 @@ def notice(title: str, lines: Iterable[str] = ()) -> dict[str, Any]:
     return {"title": title, "lines": list(lines)}
 
 
-def section(ident: str, nav: str, *, title: str = "", **parts: Any) -> dict[str, Any]:
-    """A section of a front page. `nav`: its name in the navigation, and its heading unless `title` is given."""
+def section(ident: str, nav: str, *, title: str = "", ask: str = "", **parts: Any) -> dict[str, Any]:
+    """A section of a front page. `nav`: its name in the navigation, and its heading unless `title` is given. `ask`: the
+    question that it answers; the section is folded until it is asked for. Without one it is open."""
     lists = ("figures", "tables", "texts", "links", "picker", "reasons")
     empty: dict[str, Any] = {**{name: [] for name in lists}, "reasons_title": "", "code": ""}
-    return {**empty, "id": ident, "nav": nav, "title": title or nav, **parts}
+    return {**empty, "id": ident, "nav": nav, "title": title or nav, "ask": ask, **parts}

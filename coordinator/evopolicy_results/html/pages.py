@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 from markupsafe import Markup, escape
@@ -18,14 +18,16 @@ from evopolicy_results.html.rendering import page
 from evopolicy_results.html.run_page import run_view, submit_rows
 from evopolicy_results.reading.environments import grouped, title_of
 from evopolicy_results.reading.records import Run
+from evopolicy_results.studies.answers import answers_of
 from evopolicy_results.studies.palette import Look
 from evopolicy_results.studies.study import Study
+from evopolicy_results.tables.report_tables import MEANS
 from evopolicy_results.tables.table import Column, Table, shown
 
 _FILTER_FROM = 9
 """Number of rows from which a table has a filter."""
-_RANKS_FROM = 4
-"""Number of environments from which a report begins with rank scores; with fewer, returns say more."""
+_ROWS = 20
+"""Rows of a table that show before it is asked for all."""
 _LONG = 60
 """Number of characters from which a cell's text is broken into lines."""
 FORMS = (("CSV", "csv"), ("Markdown", "md"), ("LaTeX", "tex"))
@@ -35,61 +37,79 @@ FORMS = (("CSV", "csv"), ("Markdown", "md"), ("LaTeX", "tex"))
 class _Section(NamedTuple):
     ident: str
     nav: str
-    title: str = ""
-    text: str = ""
+    ask: str
+    """The reader's question that it answers."""
     figures: str = ""
     tables: str = ""
-    """Names of figures and of tables. `name_*` has one for each suite, `name_+` one for each suite with means
-    over environments. All names between two semicolons are of the first suite, then of the next."""
+    """Names of figures and of tables. `name_*` has one for each suite."""
+    text: str = ""
 
 
 _SECTIONS = (
-    _Section("returns", "Returns", "Held-out returns", tables="heldout_*; cells_*"),
-    _Section("leaderboard", "Leaderboard", figures="rank_scores_+", tables="leaderboard_+ incomplete_+"),
+    _Section(
+        "returns", "Returns", "How much does each agent return on each environment?", tables="heldout cells"
+    ),
+    _Section(
+        "leaderboard",
+        "Leaderboard",
+        "Who ranks first over all environments?",
+        "rank_scores_*",
+        "leaderboard incomplete",
+    ),
     _Section(
         "statistics",
         "Statistics",
-        "How sure the scores are",
-        "Intervals are at 95 %. Each table says over what: the cases of one run, or runs and cases. No verdict"
-        " contradicts the interval beside it; the exact test of runs and the correction for many pairs can only"
-        " withhold one.",
+        "Which differences are real, and how small a difference can these runs show?",
         "profiles_*",
-        "resolution_*; aggregates_+ improvement_+; pairs_* generalisation_*",
+        "pairs resolution aggregates improvement generalisation",
     ),
-    _Section("starts", "Runs from one state", tables="starts"),
+    _Section(
+        "starts",
+        "Runs from one state",
+        "How do runs differ that start from the same submit?",
+        tables="starts",
+    ),
     _Section(
         "worlds",
         "Worlds",
-        "Environments and their worlds",
+        "Do the agents rely on rules that they did not confirm?",
+        "worlds",
+        "worlds",
         "A world is the environment with altered rules. A lower score there shows knowledge that these rules do not"
         " confirm, or too little exploration: compare with agents that know nothing of the environments.",
-        "worlds",
-        "worlds",
     ),
-    _Section("evolution", "Score evolution", figures="score_evolution_*", tables="evolution"),
+    _Section(
+        "evolution", "Score evolution", "How fast does each agent improve?", "score_evolution_*", "evolution"
+    ),
     _Section(
         "demand",
         "Task demand",
-        "Performance by task demand",
+        "Which agents build machinery, and which tune constants?",
+        "normalised_*",
+        "normalised",
         "Synthesis-dominant tasks need machinery (perception, memory, planning); tuning-dominant ones mostly need the"
         " right constants. This is one way to read the results, not a classification of tasks.",
-        "normalised_*",
-        "normalised_+",
     ),
-    _Section("edits", "Edits", "What edits do", "", "edit_hits edit_size", "edit_types edit_sizes"),
-    _Section("timelines", "Timelines", "Code-phase timelines"),
-    _Section("structure", "Structure", "Realised structure", "", "structure", "structure"),
-    _Section("cost", "Cost and audit", "", "", "tokens wall_time", "tokens audit"),
+    _Section("edits", "Edits", "Which kinds of edits help?", "edit_hits edit_size", "edit_types edit_sizes"),
+    _Section("timelines", "Timelines", "When did each run change its approach?"),
+    _Section("structure", "Structure", "How large are the selected policies?", "structure", "structure"),
+    _Section(
+        "cost",
+        "Cost and audit",
+        "How many tokens and how much time did the runs use?",
+        "tokens wall_time",
+        "tokens audit",
+    ),
     _Section(
         "feedback",
-        "Feedback use",
-        "",
-        "Each run has a page: what its agent read and said before every submit, what it changed, and what came of it,"
-        " with all checkpoints and their differences.",
+        "Runs",
+        "How did one run go?",
+        text="Each run has a page: what its agent read and said before every submit, what it changed, and what came of"
+        " it, with all checkpoints and their differences.",
     ),
-    _Section("replays", "Replays"),
-    _Section("setup", "Setup", tables="agents environments not_told"),
-    _Section("left-out", "Left out"),
+    _Section("replays", "Replays", "How do the selected policies look at work?"),
+    _Section("setup", "Setup", "Which settings did the runs have?", tables="agents environments not_told"),
+    _Section("left-out", "Left out", "Which folders are not in this report?"),
 )
 
 
@@ -104,28 +124,25 @@ def index_page(
     replay_links: Mapping[str, str],
 ) -> str:
     """`index.html`: every section with content. Without a `title` it names the suites."""
-    n_envs = len({env for suite in study.suites for env in suite.table.environments})
-    folded = ("pairs_", "generalisation_", "cells_")[: 3 if n_envs >= _RANKS_FROM else 2]
-    views = {
-        table.name: {**table_view(table, trace_links), "folded": table.name.startswith(folded)}
-        for table in tables
-    }
+    is_ranked = any(suite.is_ranked for suite in study.suites)
+    shown_tables = [table for table in tables if is_ranked or table.name not in MEANS]
+    views = {table.name: table_view(table, trace_links) for table in shown_tables}
+    answers = answers_of(study)
     by_name = {figure.name: figure for figure in figures}
     timelines = [figure for figure in figures if figure.name.startswith("timeline_")]
 
     def named(names: str) -> list[str]:
+        suites = [suite.name for suite in study.suites]
         return [
-            name[:-1] + suite.name if name.endswith(("_*", "_+")) else name
-            for group in names.split(";")
-            for suite in study.suites
-            for name in group.split()
-            if suite.is_ranked or not name.endswith("_+")
+            name
+            for each in names.split()
+            for name in ([each[:-1] + suite for suite in suites] if "*" in each else [each])
         ]
 
     parts: dict[str, dict[str, Any]] = {
         each.ident: {
-            "figures": [by_name[name] for name in dict.fromkeys(named(each.figures)) if name in by_name],
-            "tables": [views[name] for name in dict.fromkeys(named(each.tables)) if name in views],
+            "figures": [by_name[name] for name in named(each.figures) if name in by_name],
+            "tables": [views[name] for name in named(each.tables) if name in views],
             "texts": [each.text] if each.text else [],
         }
         for each in _SECTIONS
@@ -142,69 +159,28 @@ def index_page(
     parts["replays"] = {"texts": [videos if links else none], "links": links}
     nothing = "Nothing: every run folder that was found is in this report."
     parts["left-out"] = {"tables": [views["left_out"]]} if study.left_out else {"texts": [nothing]}
-    first = ["returns", "evolution"]
-    if n_envs >= _RANKS_FROM:
-        parts["leaderboard"]["tables"] += parts.pop("returns")["tables"]
-        first = []
     sections = [
-        section(each.ident, each.nav, title=each.title, **parts[each.ident])
-        for each in sorted(_SECTIONS, key=lambda one: one.ident not in first)
-        if each.ident in parts
+        section(each.ident, each.nav, title=each.nav, ask=each.ask, **parts[each.ident]) for each in _SECTIONS
     ]
-    n_started = sum(run.record.start is not None for run in study.runs)
-    counts = {
-        "agents": len(study.entries),
-        "environments": n_envs,
-        "runs": len(study.runs),
-        **({"of these from a submit": n_started} if n_started else {}),
-        "submits": sum(len(run.submits) for run in study.runs),
-    }
-    facts = [(noun if n != 1 else noun.removesuffix("s"), n) for noun, n in counts.items()]
     return page(
         "index",
         title=title or ", ".join(suite.title for suite in study.suites) + ": policy evolution report",
-        lead="Agents evolve an executable policy under a budget of train episodes; the checkpoint that hidden"
-        " validation selects is scored on hidden held-out cases.",
-        facts=[*facts, ("left out", len(study.left_out))],
+        lead=answers.scope,
+        facts=[],
         looks=looks,
-        notices=_notices(study),
+        notices=[notice(study.post_hoc)] if study.post_hoc else [],
+        answers=answers,
+        overview=by_name.get("overview"),
         sections=[
             each
             for each in sections
             if each["figures"] or each["tables"] or each["links"] or each["id"] in ("replays", "left-out")
         ],
-        footer="Scores rank held-out means within each environment; everything below the leaderboard is a diagnostic"
-        " and no part of the score. Made by evopolicy report.",
+        footer="Agents evolve an executable policy under a budget of train episodes; the checkpoint that hidden"
+        " validation selects is scored on hidden held-out cases. Only the held-out returns and their ranks are scores;"
+        " all else is a diagnostic. Made by evopolicy report.",
         data="report.json",
     )
-
-
-_NOTICES: tuple[tuple[Callable[[Run], bool], str], ...] = (
-    (lambda run: not run.record.versions.data_secret,
-     "played public splits, of case files or a public seed: agents and models may know the hidden cases."),
-    (lambda run: run.simulation_allowed,
-     "let their agent simulate, or are from before there was a rule against it."),
-    (lambda run: run.record.line.jail == "none", "had no jail around their agent, or that of a run they start from."),
-    (lambda run: run.record.hidden_isolation == "unknown",
-     "do not tell whether hidden episodes and agents shared a kernel: they are from before it was recorded."),
-    (lambda run: run.record.hidden_isolation == "shared",
-     "were played while hidden episodes and agents could share a kernel (--hidden-isolation off)."),
-    (lambda run: run.record.hidden_isolation == "waived",
-     "had agents whose place the operator vouched for (--agent-host elsewhere)."),
-    (lambda run: run.record.experiment_dimensions.hidden_cases == "per_run",
-     "had hidden cases of their own: no two scores are on the same cases, so differences between runs cannot be"
-     " paired by case."),
-)  # fmt: skip
-"""Remarks on runs, each after the condition under which it holds of a run."""
-
-
-def _notices(study: Study) -> list[dict[str, Any]]:
-    notices = [notice(study.post_hoc)] if study.post_hoc else []
-    if study.mixtures:
-        title = "These runs are no fair comparison: they were mixed on purpose, and differ in"
-        notices.append(notice(title, map(str, study.mixtures)))
-    counts = [(sum(map(holds, study.runs)), text) for holds, text in _NOTICES]
-    return notices + [notice(f"{n} of {len(study.runs)} runs {text}") for n, text in counts if n]
 
 
 def table_view(table: Table, pages: Mapping[str, str] = {}) -> dict[str, Any]:
@@ -214,20 +190,33 @@ def table_view(table: Table, pages: Mapping[str, str] = {}) -> dict[str, Any]:
     ]
     titles = [escape(visible(column.title)).replace(" /", Markup("&nbsp;/")) for column in columns]
     runs = table.runs or [""] * len(table.rows)
+    brief, _, method = table.caption.partition("? ")
+    if method:
+        brief += "?"
+    else:
+        brief, _, method = table.caption.partition(". ")
+        brief += "." if method else ""
     return {
         "id": table.name.replace("_", "-") + "-table",
         "title": table.title,
-        "caption": table.caption,
+        "caption": brief,
+        "method": method,
         "files": [(label, f"tables/{table.name}.{suffix}") for label, suffix in FORMS],
         "filter": len(table.rows) >= _FILTER_FROM,
-        "folded": False,
+        "short": len(table.rows) > _ROWS,
         "columns": [
             {"title": title.replace("-", "\u2011"), "numeric": column.kind != "text", "note": column.note}
             for column, title in zip(columns, titles, strict=True)
         ],
         "rows": [
             [
-                _cell(column, row.get(column.key), table.marks.get((number, column.key), 0), pages.get(run))
+                _cell(
+                    column,
+                    row.get(column.key),
+                    table.marks.get((number, column.key), 0),
+                    pages.get(run),
+                    table.digits.get((number, column.key)),
+                )
                 for column in columns
             ]
             for number, (row, run) in enumerate(zip(table.rows, runs, strict=True))
@@ -235,13 +224,15 @@ def table_view(table: Table, pages: Mapping[str, str] = {}) -> dict[str, Any]:
     }
 
 
-def _cell(column: Column, value: Any, mark: int, page_of_run: str | None) -> dict[str, Any]:
+def _cell(
+    column: Column, value: Any, mark: int, page_of_run: str | None, digits: int | None
+) -> dict[str, Any]:
     numeric = column.kind != "text"
     is_long = not numeric and len(str(value)) > _LONG
     classes = {"n": numeric, "first": mark == 1, "second": mark == 2}
     classes |= {"none": value is None and not numeric, "long": is_long}
     return {
-        "text": shown(value, column),
+        "text": shown(value, column, digits),
         "value": ("" if value is None else value) if numeric else None,
         "cls": " ".join(name for name, holds in classes.items() if holds),
         "href": page_of_run if column.key == "run" else None,

@@ -137,7 +137,7 @@ def run_view(
         "curve": part(
             "figure",
             ident="curve",
-            svg=Markup(_curve(rows, budget, reference)),
+            svg=Markup(_curve(rows, budget, reference, "" if look is None else look.colour)),
             empty="No submit was ok." if is_finished else "No submit has a verdict yet.",
             title="Train returns over budget",
             caption="Mean train return of every ok submit, and the best so far.",
@@ -166,12 +166,15 @@ def run_view(
     return view
 
 
-def _curve(rows: Sequence[SubmitRow], budget: int, reference: tuple[str, float] | None) -> str:
+def _curve(rows: Sequence[SubmitRow], budget: int, reference: tuple[str, float] | None, colour: str) -> str:
     ok = [row.submit for row in rows if row.submit.status == "ok"]
     points = [(float(one.consumed), one.mean_return) for one in ok if one.mean_return is not None]
     best = itertools.accumulate((mean for _, mean in points), max)
     rising = [(at, mean) for (at, _), mean in zip(points, best, strict=True)]
-    lines = [Line("mean train return", points, dots=True), Line("best so far", rising, steps=True)]
+    lines = [
+        Line("mean train return", points, dots=True, colour=colour),
+        Line("best so far", rising, steps=True, colour=colour),
+    ]
     return chart(
         "Train returns over budget",
         "train episodes used",

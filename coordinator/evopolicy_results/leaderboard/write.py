@@ -150,6 +150,7 @@ def _write_pages(bundles: Sequence[LabBundle], out: Path, title: str, tell: Tell
         ],
         notices=_notices(bundles),
         sections=sections,
+        answers=None,
         looks=looks(sorted(entries), reference),
         footer=f"{_MADE_BY} from published results, each checked before it is shown.",
         data="",
@@ -314,7 +315,8 @@ def _table(
         "caption": caption,
         "files": [],
         "filter": len(cells) > 8,
-        "folded": False,
+        "method": "",
+        "short": False,
         "columns": [
             {"title": name, "numeric": bool(cells) and cells[0][place]["value"] is not None, "note": ""}
             for place, name in enumerate(columns.split(";"))

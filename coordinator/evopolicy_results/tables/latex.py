@@ -147,7 +147,10 @@ def to_latex(table: Table) -> str:
 
 
 def _column(table: Table, column: Column) -> _Column:
-    texts = [shown(row.get(column.key), column) for row in table.rows]
+    texts = [
+        shown(row.get(column.key), column, table.digits.get((place, column.key)))
+        for place, row in enumerate(table.rows)
+    ]
     is_long = column.kind == "text" and max(map(len, texts), default=0) > _LONG
     cells = [
         _MARKED[table.marks.get((number, column.key), 0)].format(_cell(text, column, is_long))

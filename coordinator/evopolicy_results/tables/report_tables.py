@@ -11,6 +11,7 @@ from evopolicy_results.behaviour.edits import FEATURES, demand_of
 from evopolicy_results.reading.environments import family_of, family_title, grouped, suite_size, title_of
 from evopolicy_results.scoring.evolution import Evolution
 from evopolicy_results.scoring.scores import DEMANDS, Cell, mean_of_all, on_known_scale
+from evopolicy_results.statistics.digits import bounds_text, decimals
 from evopolicy_results.studies.study import Study, Suite
 from evopolicy_results.tables.run_tables import ENTRY, ENV, HARNESS, RUN, RUNS, one_or_all, tables_of_runs
 from evopolicy_results.tables.statistics_tables import OVER, checkpoints, starts_table, statistics_tables
@@ -20,7 +21,7 @@ from evopolicy_results.tables.table import (
     Table,
     best_marks,
     interval_text,
-    span,
+    of_suites,
     tabulated,
     with_interval,
 )
@@ -36,12 +37,23 @@ _KNOWN = Column(
 )
 
 
+MEANS = frozenset({"leaderboard", "incomplete", "aggregates", "improvement", "normalised"})
+"""Tables of means over environments."""
+
+
 def tables_of(study: Study) -> list[Table]:
     """Every table of the report in order. Tables without rows are omitted, except for `left_out`."""
-    scored: list[Table] = []
+    kinds: dict[str, list[tuple[Suite, Table]]] = {}
     for suite in study.suites:
-        scored += [_aggregate(suite, study), _incomplete(suite), _heldout(suite), _cells(suite)]
-        scored += [*statistics_tables(suite), _normalised(suite)]
+        own = (_aggregate(suite, study), _incomplete(suite), _heldout(suite), _cells(suite))
+        for table in (*own, *statistics_tables(suite), _normalised(suite)):
+            if table.rows:
+                kinds.setdefault(table.name, []).append((suite, table))
+    scored: list[Table] = []
+    for name, several in kinds.items():
+        # A mean over one environment tells no more than its return.
+        ranked = [each for each in several if each[0].is_ranked] if name in MEANS else several
+        scored.append(of_suites([(suite.title, table) for suite, table in ranked or several]))
     scored.append(_worlds(study))
     if study.post_hoc:
         scored = [replace(table, caption=f"{table.caption} {study.post_hoc}") for table in scored]
@@ -79,10 +91,11 @@ def _aggregate(suite: Suite, study: Study) -> Table:
             }
         )
         if (estimate := standings.of(row.entry)) is not None:
-            has_spread = estimate.score_low < estimate.score_high
-            interval = span(estimate.score_low, estimate.score_high, 3) if has_spread else None
+            low, high = estimate.score_low, estimate.score_high
             rows[-1] |= {
-                "score_interval": interval or "no spread: the same in each draw",
+                "score_interval": bounds_text(row.score or 0.0, low, high)
+                if low < high
+                else "no spread: the same in each draw",
                 "rank_interval": f"{estimate.rank_low} to {estimate.rank_high}",
                 "ties": estimate.ties,
             }
@@ -114,7 +127,8 @@ def _aggregate(suite: Suite, study: Study) -> Table:
         RUNS,
     )
     caption = (
-        "Rank scores: within each environment entries are ranked by held-out mean return, ties sharing the better rank,"
+        "Which agent ranks highest over all environments? Within each environment entries are ranked by held-out"
+        " mean return, ties sharing the better rank,"
         " and s = 1 − (rank − 1)/(N − 1); families and the suite are means over their environments."
     )
     caption += " Budget: train episodes of a run." if budgets else ""
@@ -125,7 +139,7 @@ def _aggregate(suite: Suite, study: Study) -> Table:
             f" rank interval is what these comparisons leave.{checkpoints(suite)}"
         )
     return Table(
-        name=f"leaderboard_{suite.name}",
+        name="leaderboard",
         title=f"{suite.title} leaderboard",
         caption=caption,
         columns=columns,
@@ -137,7 +151,7 @@ def _aggregate(suite: Suite, study: Study) -> Table:
 def _incomplete(suite: Suite) -> Table:
     n = len(suite.table.environments)
     return tabulated(
-        f"incomplete_{suite.name}",
+        "incomplete",
         f"{suite.title} incomplete entries",
         (
             ENTRY,
@@ -156,25 +170,31 @@ def _incomplete(suite: Suite) -> Table:
 def _heldout(suite: Suite) -> Table:
     rows: list[dict[str, Any]] = []
     marks: dict[tuple[int, str], int] = {}
+    digits: dict[tuple[int, str], int] = {}
     for i, standing in enumerate([*suite.board.standings, *suite.board.incomplete]):
         row: dict[str, Any] = {"entry": standing.entry, "harness": standing.harness}
         for env in suite.table.environments:
             if (cell := suite.board.cells.get((standing.entry, env))) is not None:
                 row[env] = cell.mean
+                known = suite.statistics.means.get((standing.entry, env))
+                if known is not None and (n := decimals(known.low, known.high)) is not None:
+                    digits[i, env] = n
                 if cell.mean is not None and cell.rank in (1, 2) and len(suite.board.standings) > 1:
                     marks[i, env] = cell.rank
         rows.append(row)
     columns = [Column(env, title_of(env), "number") for env in suite.table.environments]
     return Table(
-        name=f"heldout_{suite.name}",
+        name="heldout",
         title=f"{suite.title} held-out returns",
-        caption="Mean return of the validation-selected policy on the held-out cases, in each environment's"
+        caption="How much does each agent's selected policy return on the hidden held-out cases? Means in each"
+        " environment's"
         " own units: compare within a column only. Best and second-best are marked. The random reference"
         " plays the same cases. A dash is a cell that was not run, or a run with no ok submit. Incomplete"
         " entries come last, without marks.",
         columns=(ENTRY, HARNESS, *columns),
         rows=tuple(rows),
         marks=marks,
+        digits=digits,
     )
 
 
@@ -188,13 +208,13 @@ def _cells(suite: Suite) -> Table:
 
     place = {env: i for i, env in enumerate(suite.table.environments)}
     table = tabulated(
-        f"cells_{suite.name}",
+        "cells",
         f"{suite.title} cells",
         (
             ENV,
             Column("family", "Family", of=lambda cell: family_title(family_of(cell.env))),
             ENTRY,
-            Column("mean", "Held-out mean", "number"),
+            Column("mean", "Held-out mean", "number", spread=lambda cell: means.get((cell.entry, cell.env))),
             Column("interval", INTERVAL, of=lambda cell: interval_text(means.get((cell.entry, cell.env)))),
             replace(OVER, of=over),
             RUNS,
@@ -206,8 +226,9 @@ def _cells(suite: Suite) -> Table:
             suite.board.cells.values(),
             key=lambda cell: (place[cell.env], cell.rank is None, cell.rank or 0, cell.entry.casefold()),
         ),
-        "Every entry on every environment: mean over its runs, 95 % interval of the mean over what the column Over"
-        " names, rank and rank score (of entries that played every environment). Entries share their cases, so two"
+        "How sure is each mean? Every entry on every environment: mean over its runs, 95 % interval of the mean over"
+        " what the column Over names, rank and rank score (of entries that played every environment). Entries share"
+        " their cases, so two"
         " of these intervals may overlap where the difference is sure: compare by the table of differences.",
     )
     has = {"score": suite.is_ranked, "known": any(row["known"] is not None for row in table.rows)}
@@ -230,7 +251,7 @@ def _normalised(suite: Suite) -> Table:
             bold |= {(len(rows), a): 1 for a in agents}
             rows.append({"demand": demand, "env": f"{demand.capitalize()} mean", **means})
     return Table(
-        name=f"normalised_{suite.name}",
+        name="normalised",
         title=f"{suite.title} normalised performance",
         caption="Held-out return on the random-to-best scale, clipped to 0 … 1, by dominant task demand: 0 is"
         " the random reference on the same cases, 1 the best agent on that environment. Bold: means of a"

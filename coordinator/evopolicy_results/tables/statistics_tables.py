@@ -36,11 +36,12 @@ def statistics_tables(suite: Suite) -> list[Table]:
     n_unpaired = sum(pair.n_left_out > 0 for pair in results.pairs)
     return [
         tabulated(
-            f"pairs_{suite.name}",
+            "pairs",
             f"{suite.title} differences",
             (ENV, *_PAIR),
             results.pairs,
-            "Every two entries on every environment: first minus second, in held-out returns of the cases that both"
+            "Is one agent better than another on an environment? First minus second, in held-out returns of the"
+            " cases that both"
             " have. Interval: 95 %, for one environment and pair alone, over what the column Over names. p: of no"
             " difference, two-sided, from the interval's own distribution; it is at most 0.05 exactly if the interval"
             " excludes 0. Exchange p: exact test that exchanges the runs of both agents, on these cases; it does not"
@@ -56,19 +57,27 @@ def statistics_tables(suite: Suite) -> list[Table]:
         ),
         _resolution(suite),
         tabulated(
-            f"aggregates_{suite.name}",
+            "aggregates",
             f"{suite.title} aggregates",
             (
                 ENTRY,
-                Column("iqm", "IQM", "number", note="Interquartile mean.", of="iqm.value"),
-                Column("iqm_interval", INTERVAL, of=lambda one: interval_text(one.iqm, 2)),
+                Column(
+                    "iqm",
+                    "IQM",
+                    "number",
+                    note="Interquartile mean.",
+                    of="iqm.value",
+                    spread=lambda one: one.iqm,
+                ),
+                Column("iqm_interval", INTERVAL, of=lambda one: interval_text(one.iqm)),
                 *itertools.chain(*map(_above, _SHOWN_TAUS)),
                 ENVIRONMENTS,
                 RUNS,
                 Column("over", "Over", note="What the bootstrap draws anew."),
             ),
             results.aggregates,
-            "Over the normalised scores of single runs, not clipped, on the environments that have a random-to-best"
+            "How good is a typical run of each agent? Over the normalised scores of single runs, not clipped, on"
+            " the environments that have a random-to-best"
             " scale (Agarwal et al. 2021). IQM: mean of the middle half. Above: share of the runs whose normalised"
             " score is above it (the performance profile). Intervals: 95 %, percentiles of a bootstrap stratified by"
             " environment, over what the column Over names; the scale is estimated again in each resample. The best"
@@ -77,16 +86,22 @@ def statistics_tables(suite: Suite) -> list[Table]:
             f" to {LEAST_RUNS - 1} are too few for the intervals of shares." + checkpoints(suite),
         ),
         tabulated(
-            f"improvement_{suite.name}",
+            "improvement",
             f"{suite.title} probability of improvement",
             (
                 *_PAIR[:2],
-                Column("probability", "Probability", "number", of="probability.value"),
+                Column(
+                    "probability",
+                    "Probability",
+                    "number",
+                    of="probability.value",
+                    spread=lambda one: one.probability,
+                ),
                 Column("interval", INTERVAL, of=lambda one: interval_text(one.probability)),
                 ENVIRONMENTS,
             ),
             results.improvements,
-            "How probably a run of the first agent scores above a run of the second, ties counting half, mean over the"
+            "How often does a run of the first agent beat a run of the second? Ties count half; mean over the"
             " environments that have a scale (Agarwal et al. 2021). Interval: 95 %, stratified bootstrap over runs and"
             " their cases, or over the cases of single runs." + checkpoints(suite),
         ),
@@ -147,7 +162,7 @@ _UNPAIRED = "Cases that only some of the runs have."
 _PAIR = (
     Column("first", "First"),
     Column("second", "Second"),
-    Column("gap", "Difference", "number", of="gap.value"),
+    Column("gap", "Difference", "number", of="gap.value", spread=lambda pair: pair.gap),
     Column("interval", INTERVAL, of=lambda pair: interval_text(pair.gap) or pair.reason or None),
     replace(OVER, of=_with_interval("over")),
     Column("method", "Method", of=_with_interval("method")),
@@ -207,8 +222,8 @@ def _resolution(suite: Suite) -> Table:
         return Column(key, f"Repeats for {share:g}", of=lambda one: (n := one.repeats(share)) and str(n))
 
     return tabulated(
-        f"resolution_{suite.name}",
-        f"{suite.title} resolution",
+        "resolution",
+        f"{suite.title} smallest visible differences",
         (
             replace(ENV, of=lambda one: "Mean of all" if one is whole else title_of(one.env)),
             Column("gap", "Smallest difference", "number", of=lambda one: None if one is whole else one.gap),
@@ -218,8 +233,11 @@ def _resolution(suite: Suite) -> Table:
             *map(repeats, GAPS),
         ),
         [*suite.statistics.resolutions, *([whole] if whole is not None else [])],
-        "The smallest difference between two agents that these cases and runs resolve: the half width of its 95 %"
-        " interval, median over pairs, in returns and as a share of the random-to-best scale. Of a true difference of"
+        "How small a difference can these runs and cases show, and how many more runs would a smaller one need? The"
+        " half"
+        " width of a difference's 95 % interval, median over pairs, in returns and as a share of the random-to-best"
+        " scale."
+        " Of a true difference of"
         " that size, every second interval excludes 0. Repeats: runs of each agent that a difference of that share of"
         f" the scale would need, at least {least_runs(ALPHA)}, as fewer cannot be significant;"
         f' "more cases" where more runs do not help (up to {MAX_REPEATS} were tried); a'
@@ -257,10 +275,12 @@ def _generalisation(suite: Suite) -> Table:
         for entry, mean in suite.statistics.optimism.items()
     ]
     return Table(
-        name=f"generalisation_{suite.name}",
+        name="generalisation",
         title=f"{suite.title} generalisation",
-        caption="Mean return of the selected checkpoint on its own submit's train episodes, on validation,"
-        " and on held-out cases; means over completed runs. Optimism: validation minus held-out. Selection"
+        caption="Do the selected policies hold on cases that neither the agent nor the selection saw? Mean return"
+        " of the"
+        " selected checkpoint on its own submit's train episodes, on validation, and on held-out cases, over"
+        " completed runs. Optimism: validation minus held-out. Selection"
         " takes the best of many validation scores, so it is above 0 on average even where an agent fits"
         " nothing. Normalised: as a share of the random-to-best scale; its last rows are means over"
         " environments with a 95 % t interval whose unit is the environment. Success: share of held-out"

@@ -8,15 +8,18 @@ from __future__ import annotations
 
 import csv
 import io
+import itertools
 import re
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any, Literal
 
 import msgspec
+from msgspec.structs import replace
 
 from evopolicy_common.statistics.intervals import Estimate
 from evopolicy_common.terminal import csv_cell, one_line
 from evopolicy_results.statistics.aggregates import Bounded
+from evopolicy_results.statistics.digits import bounds_text, decimals, rounded
 
 Kind = Literal["text", "integer", "number", "percent"]
 INTERVAL = "95 % interval"
@@ -46,6 +49,8 @@ class Column(msgspec.Struct, frozen=True):
     """One-sentence explanation, shown on demand."""
     of: Callable[[Any], Any] | str = ""
     """Its value in a record: a function, or a path of attributes (`at`); default: `key`."""
+    spread: Callable[[Any], Estimate | Bounded | None] | None = None
+    """The value with its interval, which gives the number of decimals."""
 
     def value(self, record: Any) -> Any:
         """The value in a record."""
@@ -63,6 +68,8 @@ class Table(msgspec.Struct, frozen=True, kw_only=True):
     rows: tuple[dict[str, Any], ...]
     marks: dict[tuple[int, str], int] = {}
     """(row, column key) to 1 for the best and 2 for the second-best of its column."""
+    digits: dict[tuple[int, str], int] = {}
+    """(row, column key) to the decimals that the number's interval supports."""
     runs: tuple[str, ...] = ()
     """By row, the name of the run that it is about; empty if the table is not about runs."""
 
@@ -83,14 +90,50 @@ def tabulated(
 ) -> Table:
     """A row a record. `run`: the name of the run that a record is about."""
     records = list(records)
+    known = [
+        ((place, column.key), each)
+        for place, record in enumerate(records)
+        for column in columns
+        if column.spread is not None and (each := column.spread(record)) is not None
+    ]
     return Table(
         name=name,
         title=title,
         caption=caption,
         columns=tuple(columns),
         rows=tuple(rows_of(records, columns)),
+        digits={key: n for key, each in known if (n := decimals(each.low, each.high)) is not None},
         runs=tuple(map(run, records)) if run is not None else (),
     )
+
+
+def of_suites(tables: Sequence[tuple[str, Table]]) -> Table:
+    """One table from those of several suites, given with the suites' titles: its first column names the suite."""
+    (_, first), *others = tables
+    if not others:
+        return first
+    every = [table for _, table in tables]
+    columns = {column.key: column for table in every for column in table.columns}
+    starts = list(itertools.accumulate((len(table.rows) for table in every), initial=0))
+    captions = dict.fromkeys(sentence for table in every for sentence in _SENTENCE.findall(table.caption))
+    return replace(
+        first,
+        title=first.title.removeprefix(tables[0][0]).strip().capitalize(),
+        caption=" ".join(captions),
+        columns=(Column("suite", "Suite"), *columns.values()),
+        rows=tuple({"suite": title, **row} for title, table in tables for row in table.rows),
+        marks=_moved(zip(starts, (table.marks for table in every), strict=False)),
+        digits=_moved(zip(starts, (table.digits for table in every), strict=False)),
+    )
+
+
+def _moved(
+    each: Iterable[tuple[int, dict[tuple[int, str], int]]],
+) -> dict[tuple[int, str], int]:
+    return {(start + row, key): value for start, own in each for (row, key), value in own.items()}
+
+
+_SENTENCE = re.compile(r"\S.*?[.:](?=\s|$)")
 
 
 def with_interval(
@@ -98,33 +141,24 @@ def with_interval(
 ) -> tuple[Column, Column]:
     """Columns of an estimate's value and of its interval."""
     return (
-        Column(key, title, "number", digits=digits, of=lambda each: of(each).value),
-        Column(f"{key}_interval", INTERVAL, of=lambda each: interval_text(of(each), digits)),
+        Column(key, title, "number", digits=digits, of=lambda each: of(each).value, spread=of),
+        Column(f"{key}_interval", INTERVAL, of=lambda each: interval_text(of(each))),
     )
 
 
-def rounded(value: float, digits: int) -> str:
-    """Without a minus before a 0; an ASCII minus else, so that numbers can be copied."""
-    text = f"{value:.{digits}f}"
-    return text.removeprefix("-") if float(text) == 0.0 else text
-
-
-def span(low: float | None, high: float | None, digits: int) -> str | None:
-    """`low to high`; None without bounds."""
-    return None if low is None or high is None else f"{rounded(low, digits)} to {rounded(high, digits)}"
-
-
-def interval_text(estimate: Estimate | Bounded | None, digits: int = 3) -> str | None:
+def interval_text(estimate: Estimate | Bounded | None) -> str | None:
     """The interval, or the reason why there is none."""
     if estimate is None:
         return None
-    return span(estimate.low, estimate.high, digits) or estimate.reason or None
+    return bounds_text(estimate.value, estimate.low, estimate.high) or estimate.reason or None
 
 
-def shown(value: Any, column: Column) -> str:
-    """`value` as display text."""
+def shown(value: Any, column: Column, digits: int | None = None) -> str:
+    """`value` as display text. `digits`: decimals that its interval supports; None: the column's."""
     if value is None:
         return DASH
+    if digits is not None and isinstance(value, int | float):
+        return rounded(value, digits)
     if column.kind == "percent":
         return f"{100.0 * value:.0f} %"
     if column.kind == "number" and isinstance(value, int | float):
@@ -152,8 +186,11 @@ def to_markdown(table: Table) -> str:
     wrap = {0: "{}", 1: "**{}**", 2: "*{}*"}
     for number, row in enumerate(table.rows):
         cells = [
-            wrap[table.marks.get((number, column.key), 0)].format(_pipe(shown(row.get(column.key), column)))
+            wrap[table.marks.get(at, 0)].format(
+                _pipe(shown(row.get(column.key), column, table.digits.get(at)))
+            )
             for column in table.columns
+            for at in [(number, column.key)]
         ]
         lines.append("| " + " | ".join(cells) + " |")
     return "\n".join(lines) + "\n"

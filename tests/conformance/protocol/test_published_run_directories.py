@@ -78,7 +78,7 @@ def test_a_report_of_published_runs_fills_its_tables_and_tells_the_gaps(tmp_path
     for model, submits in (("model-a", SUBMITS), ("model-b", SUBMITS[:2])):
         write_published_run(tmp_path / "runs", model=model, submits=submits)
     tables = report(tmp_path, str(tmp_path / "runs"))
-    board = {row["entry"]: row for row in tables["leaderboard_core16"]["rows"]}
+    board = {row["entry"]: row for row in tables["leaderboard"]["rows"]}
     assert {entry: row["rank"] for entry, row in board.items()} == {"model-a": 1, "model-b": 2}
     assert [row["improvements"] for row in tables["evolution"]["rows"]] == [2, 1]
     edits = {row["entry"]: row for row in tables["edit_types"]["rows"]}
@@ -173,7 +173,7 @@ def test_runs_of_both_softwares_are_paired_by_the_cases_of_their_files(tmp_path:
     tables = report(tmp_path, str(tmp_path / "runs"), "--allow-mixed")
     assert tables["left_out"]["rows"] == []
     names = {"model-a", "model-a (published software)"}
-    (pair,) = (row for row in tables["pairs_core16"]["rows"] if {row["first"], row["second"]} == names)
+    (pair,) = (row for row in tables["pairs"]["rows"] if {row["first"], row["second"]} == names)
     assert (pair["cases"], pair["left_out"], abs(pair["gap"])) == (3, 0, 9.0)
 
 

@@ -126,7 +126,7 @@ def test_checkpoints_play_further_cases_and_the_report_uses_them(played: Played)
     done = evopolicy(played.root, "report", "runs", "--scores", "cases-8", "--out", "report", code=0)
     document = json.loads((played.root / "report" / "report.json").read_text())
     assert "cases-8: 8 further hidden cases, played post hoc" in document["post_hoc"]
-    assert "post hoc" in document["tables"]["heldout_toy"]["caption"]
+    assert "post hoc" in document["tables"]["heldout"]["caption"]
     assert "post hoc" in (played.root / "report" / "index.html").read_text()
     shown = {run["entry"]: run["score"] for run in document["runs"]}
     assert shown["mine"] == math.fsum(mine.checkpoints[0].returns) / 8

@@ -93,7 +93,7 @@ def links_of(page: Path) -> Links:
 def test_every_table_and_figure_is_written_in_every_form(report: Path) -> None:
     tables = {path.stem for path in (report / "tables").glob("*.csv")}
     assert tables >= {
-        "leaderboard_core16", "heldout_core16", "cells_core16", "normalised_core16", "leaderboard_toy", "evolution",
+        "leaderboard", "heldout", "cells", "normalised", "evolution",
         "edit_types", "structure", "edit_sizes", "tokens", "audit", "runs", "feedback_use", "agents", "environments",
         "left_out",
     }  # fmt: skip
@@ -101,7 +101,7 @@ def test_every_table_and_figure_is_written_in_every_form(report: Path) -> None:
         assert {path.stem for path in (report / "tables").glob(f"*.{suffix}")} == tables
     figures = {path.stem for path in (report / "figures").glob("*.svg")}
     assert figures >= {
-        "rank_scores_core16", "score_evolution_core16", "normalised_core16", "edit_hits", "edit_size", "structure", "tokens",  # noqa: E501
+        "overview", "rank_scores_core16", "score_evolution_core16", "normalised_core16", "edit_hits", "edit_size", "structure", "tokens",  # noqa: E501
         "wall_time", "timeline_gym_acrobot", "timeline_toy_line",
     }  # fmt: skip
     data = json.loads((report / "report.json").read_text())
@@ -147,7 +147,7 @@ def test_agents_and_environments_are_listed_as_they_were_set_up(tmp_path: Path) 
     assert (env["id"], env["family"], env["demand"], env["budget"], env["steps"]) == (
         "gym/acrobot", "Gym / Box2D", "tuning", "64", "500",
     )  # fmt: skip
-    board = table(report, "leaderboard_core16")
+    board = table(report, "leaderboard")
     assert {r["entry"]: r["budget"] for r in board} == {"Agent A": "64", "Random policy": ""}
 
 
@@ -251,7 +251,7 @@ def test_papers_table_as_input_gives_its_aggregate_table(tmp_path: Path) -> None
     source = tmp_path / "table.csv"
     source.write_text(paper.text("table1_heldout_returns"))
     reported(source, tmp_path / "report")
-    written = table(tmp_path / "report", "leaderboard_core16")
+    written = table(tmp_path / "report", "leaderboard")
     for row, printed in zip(written, paper.rows("table2_aggregate"), strict=True):
         assert row["entry"] == printed["entry"]
         assert f"{float(row['score']):.3f}" == printed["core16"]
@@ -330,7 +330,7 @@ def test_replay_path_that_leads_out_of_the_run_is_not_followed(tmp_path: Path) -
 def test_run_without_any_ok_submit_is_in_the_report(tmp_path: Path) -> None:
     write_run(tmp_path / "runs", [Version({"policy.py": "import x\n"}, (0.0,), None, "import_error")])
     write_run(tmp_path / "runs", [], entry="Idle")
-    board = table(report_on(tmp_path), "heldout_core16")
+    board = table(report_on(tmp_path), "heldout")
     assert [row["gym/acrobot"] for row in board] == ["-500.0", "", ""]
 
 

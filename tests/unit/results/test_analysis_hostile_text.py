@@ -80,7 +80,7 @@ def test_an_unforeseen_failure_spoils_one_page_alone(tmp_path: Path, monkeypatch
     (page,) = (tmp_path / "report" / "traces").glob("*Hostile*.html")
     assert "could not be made from what the run has left: ArithmeticError: &lt;b&gt;" in page.read_text()
     (page,) = (tmp_path / "report" / "traces").glob("*Honest*.html")
-    assert "Feedback use" in page.read_text()
+    assert "Feedback read" in page.read_text()
 
 
 @pytest.mark.parametrize("number", ["9" * 400, "1e308", "-1e200"])

@@ -290,5 +290,5 @@ def test_foreign_environments_have_their_runs_titles_and_families(tmp_path: Path
     title, family = rows["my/glider"]
     assert (title[:6], len(title), "\x1b" in title, family) == ("Glider", 60, False, "Score")
     # A family's name does not take the place of a column.
-    (row, *_) = tables["leaderboard_other"].rows
+    (row, *_) = tables["leaderboard"].rows
     assert {"family_score", "family_other", "score"} <= row.keys()

@@ -17,12 +17,13 @@ from evopolicy_common.records import model_calls
 from evopolicy_common.records.policies.trees import changes
 from evopolicy_common.records.summary import utc_text
 from evopolicy_common.terminal import counted, duration, number
-from evopolicy_coordinator.web.content.rendering import View, Words, ident, part, short, state_words
+from evopolicy_coordinator.web.content.rendering import Words, ident, part, short, state_words
 from evopolicy_coordinator.web.content.run_detail import IMAGES, MAX_WORDS, CodeFile, Detail, Happened
 from evopolicy_coordinator.web.content.run_folders import Reader, RunFacts, Runs, Submit
 from evopolicy_results.behaviour.trace import Trace, diff, trace
 from evopolicy_results.figures.line_chart import chart
 from evopolicy_results.html import notice
+from evopolicy_results.html.rendering import View
 from evopolicy_results.html.run_page import run_view, submit_rows
 from evopolicy_results.reading.reader import read_run
 from evopolicy_results.reading.records import Submit as Shown

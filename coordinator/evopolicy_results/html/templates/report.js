@@ -60,6 +60,7 @@
     const rows = [...table.tBodies[0].rows];
     const texts = new Map(rows.map((row) => [row, row.textContent.toLowerCase()]));
     input.addEventListener("input", () => {
+      table.classList.remove("short");
       const words = input.value.toLowerCase().split(/\s+/).filter(Boolean);
       let shown = 0;
       for (const row of rows) {
@@ -70,6 +71,22 @@
       count.textContent = shown + " of " + rows.length + " rows";
     });
   }
+  // A long table shows its first rows; a link to a folded section opens it.
+  for (const button of document.querySelectorAll("button.more")) {
+    const table = document.getElementById(button.dataset.table);
+    button.hidden = false;
+    table.classList.add("cut");
+    button.addEventListener("click", () => { table.classList.remove("short"); button.hidden = true; });
+  }
+  const unfold = () => {
+    const target = location.hash.length > 1 && document.getElementById(decodeURIComponent(location.hash.slice(1)));
+    if (!target) return;
+    for (let one = target.querySelector(":scope > details.fold") || target.closest("details"); one; one = one.parentElement.closest("details")) one.open = true;
+    target.scrollIntoView();
+  };
+  addEventListener("hashchange", unfold);
+  for (const link of document.querySelectorAll('nav.bar a[href^="#"]')) link.addEventListener("click", () => setTimeout(unfold));
+  if (document.querySelector("details.fold")) unfold();
   for (const tools of document.querySelectorAll(".tools[hidden]")) tools.hidden = false;
 
   // A figure as PNG, drawn by the browser on white in the light theme.

@@ -107,13 +107,13 @@ def test_a_report_names_equal_repeats_and_has_no_interval_over_runs(tmp_path: Pa
     played(tmp_path, (3.0, 4.0), entry="Walker")
     found = study([tmp_path])
     by_name = {table.name: table for table in tables_of(found)}
-    cells = {row["entry"]: row for row in by_name["cells_core16"].rows}
+    cells = {row["entry"]: row for row in by_name["cells"].rows}
     assert cells["Climber"]["over"] == f"cases; {BOTH}"
     assert cells["Walker"]["over"] == "runs and cases"
     assert cells["Climber"]["runs"] == 2
-    for name in ("leaderboard_core16", "pairs_core16", "aggregates_core16"):
+    for name in ("leaderboard", "pairs", "aggregates"):
         assert f"Climber, Acrobot: {BOTH}" in to_markdown(by_name[name])
-    (pair,) = (row for row in by_name["pairs_core16"].rows if row["second"] == "Walker")
+    (pair,) = (row for row in by_name["pairs"].rows if row["second"] == "Walker")
     assert (pair["compares"], pair["over"], pair["runs"]) == ("checkpoints", "cases", "1 and 2")
     table = found.suites[0].table
     assert {entry: table.cells[entry, "gym/acrobot"].repeated for entry in table.agents} == {

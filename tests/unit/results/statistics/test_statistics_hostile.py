@@ -309,18 +309,18 @@ def test_report_of_single_runs_says_that_it_compares_checkpoints(tmp_path: Path)
     write_suite(tmp_path / "runs", environments=ENVS)
     found = study([tmp_path / "runs"])
     tables = tables_of(found)
-    for name in ("leaderboard_core16", "pairs_core16", "aggregates_core16", "improvement_core16"):
+    for name in ("leaderboard", "pairs", "aggregates", "improvement"):
         assert "compares the selected checkpoints, not the agents" in table_named(tables, name).caption
-    board = table_named(tables, "leaderboard_core16")
+    board = table_named(tables, "leaderboard")
     agents = [row for row in board.rows if row["harness"] != "Uniform"]
     assert all(row["ties"] and row["score_interval"] and row["rank_interval"] for row in agents)
-    shown = table_named(tables, "pairs_core16")
+    shown = table_named(tables, "pairs")
     assert {row["compares"] for row in shown.rows} == {"checkpoints"}
     assert {row["cases"] for row in shown.rows if row["second"] != "Random policy"} == {32}
-    resolution = table_named(tables, "resolution_core16")
+    resolution = table_named(tables, "resolution")
     assert {row["repeats_0_1"] for row in resolution.rows} == {None}
     assert "profiles_core16" in {plot.name for plot in figures_of(found)}
-    general = table_named(tables, "generalisation_core16")
+    general = table_named(tables, "generalisation")
     success = {row["env"]: row.get("success") for row in general.rows if row["entry"] == "Kestrel"}
     assert success["Acrobot"] == 1.0
     assert success["Ant"] is None
@@ -330,15 +330,15 @@ def test_report_of_single_runs_says_that_it_compares_checkpoints(tmp_path: Path)
 def test_report_of_repeats_compares_agents_and_tells_repeats(tmp_path: Path) -> None:
     write_suite(tmp_path / "runs", environments=ENVS, repeats=3)
     tables = tables_of(study([tmp_path / "runs"]))
-    assert "not the agents" not in table_named(tables, "pairs_core16").caption
-    shown = table_named(tables, "pairs_core16")
+    assert "not the agents" not in table_named(tables, "pairs").caption
+    shown = table_named(tables, "pairs")
     agents = [row for row in shown.rows if row["second"] != "Random policy"]
     assert {(row["compares"], row["over"], row["method"]) for row in agents} == {
         ("agents", "runs and cases", "crossed t")
     }
     verdicts = {row["told_apart"] for row in agents}
     assert any(re.fullmatch(r"too few runs to tell with 3; about \d+ would do", v) for v in verdicts)
-    assert all(row["repeats_0_2"] for row in table_named(tables, "resolution_core16").rows)
+    assert all(row["repeats_0_2"] for row in table_named(tables, "resolution").rows)
 
 
 def test_an_incomplete_entry_stands_beside_no_complete_one_by_a_mean(tmp_path: Path) -> None:
@@ -347,22 +347,22 @@ def test_an_incomplete_entry_stands_beside_no_complete_one_by_a_mean(tmp_path: P
             shutil.rmtree(folder)
     found = study([tmp_path / "runs"])
     tables = tables_of(found)
-    (lacking,) = table_named(tables, "incomplete_core16").rows
+    (lacking,) = table_named(tables, "incomplete").rows
     assert (lacking["entry"], lacking["environments"], lacking["missing"]) == ("Kestrel", "2 of 3", "Ant")
     for name in ("leaderboard", "aggregates", "improvement"):
-        table = table_named(tables, f"{name}_core16")
+        table = table_named(tables, name)
         for text in (to_csv(table), to_latex(table), to_markdown(table)):
             assert "Northwind" in text
             assert "Kestrel" not in text
-    means = [row for row in table_named(tables, "normalised_core16").rows if row["env"] == "Tuning mean"]
+    means = [row for row in table_named(tables, "normalised").rows if row["env"] == "Tuning mean"]
     assert [row["Kestrel"] for row in means] == [None]
-    optimism = table_named(tables, "generalisation_core16").rows
+    optimism = table_named(tables, "generalisation").rows
     assert "Kestrel" not in {row["entry"] for row in optimism if row["env"] == "Mean of all"}
     # Single environments and differences keep it.
-    assert {row["env"] for row in table_named(tables, "cells_core16").rows if row["entry"] == "Kestrel"} == {
+    assert {row["env"] for row in table_named(tables, "cells").rows if row["entry"] == "Kestrel"} == {
         "Acrobot", "FourRooms",
     }  # fmt: skip
-    assert "Kestrel" in to_csv(table_named(tables, "pairs_core16"))
+    assert "Kestrel" in to_csv(table_named(tables, "pairs"))
     plots = {plot.name: plot for plot in figures_of(found)}
     for name in ("rank_scores_core16", "profiles_core16"):
         assert "Kestrel" not in {row["entry"] for row in plots[name].data}
@@ -375,9 +375,9 @@ def test_an_incomplete_entry_stands_beside_no_complete_one_by_a_mean(tmp_path: P
 def test_the_papers_own_table_has_scores_only_and_says_so() -> None:
     found = study_of([], scores=heldout_returns())
     tables = tables_of(found)
-    shown = table_named(tables, "pairs_core16")
+    shown = table_named(tables, "pairs")
     assert {row["interval"] for row in shown.rows} == {NO_RETURNS}
-    assert "ties" not in {column.key for column in table_named(tables, "leaderboard_core16").columns}
+    assert "ties" not in {column.key for column in table_named(tables, "leaderboard").columns}
     assert msgspec.json.encode(shown.rows)
 
 

@@ -91,7 +91,7 @@ def test_a_report_without_worlds_has_no_part_about_them(tmp_path: Path) -> None:
     assert found.worlds is None
     tables = {table.name: table for table in tables_of(found)}
     assert "worlds" not in tables
-    (own, floor) = sorted(tables["cells_core16"].rows, key=lambda row: -row["known"])
+    (own, floor) = sorted(tables["cells"].rows, key=lambda row: -row["known"])
     assert own["known"] == pytest.approx(0.6, abs=0.02)
     assert floor["known"] == pytest.approx(0.0)
     assert 'id="worlds"' not in write_report(found, tmp_path / "report", traces=False).read_text()
