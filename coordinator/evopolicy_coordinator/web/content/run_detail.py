@@ -175,6 +175,8 @@ class Detail:
         observed: Any = inline if any(each is not None for each in inline) else self._arrays(folder)
         observations, note = _series(observed, len(rows), "obs")
         actions, _ = _series([row.get("action") for row in rows], len(rows), "action")
+        if all(type(row.get("action")) is int for row in rows):  # a discrete action holds until the next one
+            actions = [line._replace(steps=True) for line in actions]
         rewards = [Line("reward", list(enumerate(map(_reward, rows))))]
         return len(rows), {"Reward": rewards, "Observation": observations, "Action": actions}, note
 

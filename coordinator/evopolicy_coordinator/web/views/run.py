@@ -14,6 +14,7 @@ from markupsafe import Markup
 from evopolicy_common.confined import NotThereError
 from evopolicy_common.messages.status import RetriedJobs
 from evopolicy_common.records import model_calls
+from evopolicy_common.records.policies.submits import read_submits
 from evopolicy_common.records.policies.trees import changes
 from evopolicy_common.records.summary import utc_text
 from evopolicy_common.terminal import counted, duration, number
@@ -24,7 +25,7 @@ from evopolicy_results.behaviour.trace import Trace, diff, trace
 from evopolicy_results.figures.line_chart import chart
 from evopolicy_results.html import notice
 from evopolicy_results.html.rendering import View
-from evopolicy_results.html.run_page import run_view, submit_rows
+from evopolicy_results.html.run_page import SubmitRow, run_view, submit_rows
 from evopolicy_results.reading.reader import read_run
 from evopolicy_results.reading.records import Submit as Shown
 from evopolicy_results.studies.palette import looks
@@ -42,17 +43,15 @@ def live_run_view(
 ) -> View:
     """One run: curve, submits, words, events. `retries`: the jobs of it that the cluster has played again."""
     may_show, path = runs.may_show(run), run.path
-    known = [] if path is None else reader.submits(path)
-    traced = _traced(path, run.stamp) if path is not None and run.finished else None
-    rows = submit_rows(
-        [_submit(each) for each in known] if traced is None else traced.run.submits,
-        {each.summary.submit_index: each.summary for each in known},
-        traced=None if traced is None else {row.submit.index: row for row in traced.rows},
-        folder=path if run.finished else None,
-        selected=None if traced is None else traced.run.record.outcome.best_submit_index,
-        may_show=may_show,
-        href=f"/run/{run.key}/submit/{{}}",
-    )
+    address, found = f"/run/{run.key}/submit/{{}}", None
+    if path is not None and run.finished:
+        found = _finished_rows(path, run.stamp, address, may_show=may_show)
+    if path is None or found is not None:
+        rows, traced = found or ([], None)
+    else:
+        known = reader.submits(path)
+        summaries = {each.summary.submit_index: each.summary for each in known}
+        rows, traced = submit_rows(list(map(_submit, known)), summaries, href=address), None
     view = run_view(
         rows,
         entry=run.entry,
@@ -85,12 +84,25 @@ def live_run_view(
 
 
 @lru_cache(maxsize=8)
-def _traced(folder: Path, stamp: tuple[int, int]) -> Trace | None:
-    """A finished run as a report reads it; None for one that a report leaves out. `stamp`: of its record."""
+def _finished_rows(
+    folder: Path, stamp: tuple[int, int], address: str, *, may_show: bool
+) -> tuple[list[SubmitRow], Trace | None] | None:
+    """The rows of a finished run as a report has them; None for a run that a report leaves out. `stamp`: of its record,
+    `address`: of a submit, with `{}` for its index."""
     try:
-        return trace(read_run(folder))
+        traced = trace(read_run(folder))
+        rows = submit_rows(
+            traced.run.submits,
+            {one.index: one.summary for one in read_submits(folder, traced.run.record.artifacts)},
+            traced={row.submit.index: row for row in traced.rows},
+            folder=folder,
+            selected=traced.run.record.outcome.best_submit_index,
+            may_show=may_show,
+            href=address,
+        )
     except Exception:  # an agent wrote the files; the rows then have what their summaries have
         return None
+    return rows, traced
 
 
 def _submit(one: Submit) -> Shown:
