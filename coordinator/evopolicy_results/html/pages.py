@@ -258,6 +258,7 @@ def trace_page(
     run, record = trace.run, trace.run.record
     outcome, best = record.outcome, record.outcome.best_submit_index
     closed = in_words(outcome.closed_reason)
+    checkpoints = _checkpoints(trace)
     used = run.submits[-1].consumed if run.submits else 0
     rows = submit_rows(
         run.submits,
@@ -268,7 +269,7 @@ def trace_page(
         folder=run.path,
         selected=best,
         may_show=True,
-        href="#s{:03d}-source",
+        href=lambda submit: f"#{submit.label}-source" if submit.label in checkpoints else "",
         images=image_links,
         videos=videos,
     )
@@ -301,7 +302,7 @@ def trace_page(
         lead=[*lead, *([f"ended by: {closed}"] if closed else [])],
         beside=beside,
         unplaced=trace.unplaced,
-        checkpoints=_checkpoints(trace),
+        checkpoints=checkpoints,
         replays=[],
     )
 

@@ -4,7 +4,7 @@ before it, what it changed, and what came of it."""
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -57,12 +57,13 @@ def submit_rows(
     folder: Path | None = None,
     selected: int | None = None,
     may_show: bool = False,
-    href: str = "{}",
+    href: Callable[[Submit], str],
     images: Mapping[int, Sequence[tuple[str, str]]] | None = None,
     videos: Mapping[int, str] | None = None,
 ) -> list[SubmitRow]:
     """The rows in order. `traced` and `folder`: of a finished run; `may_show`: whether its hidden results may be shown;
-    `href`: the address of a submit's code, with `{}` for its index."""
+    `href`: the address of a submit's code, empty where there
+    is none."""
     known, by_index = traced or {}, {submit.index: submit for submit in submits}
     means = [(submit.mean_return, -submit.index) for submit in submits if submit.status == "ok"]
     best = max(((mean, index) for mean, index in means if mean is not None), default=(0.0, 1))[1]
@@ -83,7 +84,7 @@ def submit_rows(
                 change="; ".join(filter(None, texts)),
                 edit=row.transition.edit if row is not None and row.transition is not None else "",
                 evidence=(row.evidence if row is not None else None) or Evidence(),
-                href=href.format(index),
+                href=href(submit),
                 images=(images or {}).get(index, ()),
                 video=(videos or {}).get(index, ""),
             )

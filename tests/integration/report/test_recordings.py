@@ -252,9 +252,12 @@ def test_trace_page_quotes_the_agent_beside_the_files_that_it_read(runs: Path, t
     (path,) = (tmp_path / "report/traces").glob("*.html")
     with Page() as page:
         page.open(path)
-        row = "document.getElementById('s002').cells"
-        assert page.run(f"{row}[2].textContent.trim()") == "feedback/submit_001/summary.json"
-        assert page.run(f"{row}[3].querySelector('blockquote').textContent").endswith(
+        row = "document.getElementById('submit-2').cells"
+        assert (
+            page.run(f"{row}[4].querySelector('.read').textContent.trim()")
+            == "feedback/submit_001/summary.json"
+        )
+        assert page.run(f"{row}[4].querySelector('blockquote').textContent").endswith(
             "I change a constant next."
         )
         assert page.problems == []

@@ -303,7 +303,8 @@ def test_replays_are_copied_and_missing_ones_said(tmp_path: Path) -> None:
     assert "its file is missing" in text
     assert 'href="replays/gym-acrobot.html"' in (report / "index.html").read_text()
     media = [target for target in links_of(page).targets if target.startswith("media")]
-    assert all((page.parent / target).exists() for target in media)
+    assert len(media) >= 3
+    assert all((page.parent / target.partition("#")[0]).exists() for target in media)
 
 
 def test_feedback_video_is_shown_beside_its_submit(tmp_path: Path) -> None:
@@ -312,7 +313,7 @@ def test_feedback_video_is_shown_beside_its_submit(tmp_path: Path) -> None:
     video.parent.mkdir(parents=True)
     video.write_bytes(MP4)
     (page,) = (report_on(tmp_path) / "traces").glob("*.html")
-    (target,) = [target for target in links_of(page).targets if target.endswith(".mp4")]
+    (target,) = {target.partition("#")[0] for target in links_of(page).targets if ".mp4" in target}
     assert target.endswith("s001.mp4")
     assert (page.parent / target).read_bytes() == MP4
 

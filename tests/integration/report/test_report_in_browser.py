@@ -38,12 +38,44 @@ def page() -> Iterator[Page]:
         yield found
 
 
+UNFOLD = "document.querySelectorAll('details.fold').forEach((one) => { one.open = true; })"
+
+
 @pytest.fixture
 def index(page: Page, report: Path) -> Page:
     page.look()
     page.problems.clear()
     page.open(report / "index.html")
+    page.run(UNFOLD)
     return page
+
+
+def test_the_first_screen_has_the_answers_and_the_picture_and_the_rest_is_folded(
+    page: Page, report: Path
+) -> None:
+    page.look(width=1280, height=800)
+    page.open(report / "index.html")
+    bottom = "document.querySelector({!r}).getBoundingClientRect().bottom"
+    assert page.run(bottom.format("dl.answers")) <= 800
+    assert page.run(bottom.format("#figure-overview")) <= 800
+    assert page.run("document.querySelector('dl.answers').innerText").startswith(
+        "Core16 (3 of 16)\nNorthwind leads: "
+    )
+    assert page.run("document.documentElement.scrollHeight") <= 3 * 800
+    folded = "document.getElementById('evolution-table').checkVisibility()"
+    assert page.run(folded) is False
+    page.run("document.querySelector('nav.bar a[href=\"#evolution\"]').click()")
+    page.until(folded)
+
+
+def test_a_long_table_ends_at_a_row_until_all_are_asked_for(index: Page) -> None:
+    table = "document.querySelector('table.short.cut')"
+    rows = f"[...{table}.tBodies[0].rows].filter((row) => row.checkVisibility()).length"
+    assert index.run(rows) == 20
+    name = index.run(f"{table}.id")
+    index.run(f"document.querySelector('button.more[data-table={name}]').click()")
+    shown = f"[...document.getElementById({name!r}).tBodies[0].rows].every((row) => row.checkVisibility())"
+    assert index.run(shown)
 
 
 def column(page: Page, table: str, place: int) -> list[str]:
@@ -161,6 +193,8 @@ def test_page_fits_a_phone_without_sideways_scrolling(page: Page, report: Path) 
     for path in [report / "index.html", *sorted((report / "traces").glob("*.html"))[:2]]:
         page.open(path)
         assert page.run("document.documentElement.scrollWidth") <= 390, path
+        page.run(UNFOLD)
+        assert page.run("document.documentElement.scrollWidth") <= 390, path
         assert page.run("window.innerWidth") == 390
 
 
@@ -224,12 +258,14 @@ def test_screen_reader_is_told_the_name_of_every_table_figure_and_control(page: 
     for path in [report / "index.html", sorted((report / "traces").glob("*.html"))[0]]:
         page.look()
         page.open(path)
+        page.run(UNFOLD)
         tree = page.accessible()
         assert [(role, name) for role, name in tree if role in named and not name.strip()] == []
         assert [role for role, _ in tree].count("main") == 1
         regions = [name for role, name in tree if role in ("region", "navigation")]
         assert len(regions) == len(set(regions)), "two places of one name"
     page.open(report / "index.html")
+    page.run(UNFOLD)
     tree = page.accessible()
     figures = len(
         page.run("[...document.querySelectorAll('figure:not([hidden]) svg[role=img]')].map((e) => e.id)")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -43,15 +43,15 @@ def live_run_view(
 ) -> View:
     """One run: curve, submits, words, events. `retries`: the jobs of it that the cluster has played again."""
     may_show, path = runs.may_show(run), run.path
-    address, found = f"/run/{run.key}/submit/{{}}", None
+    found = None
     if path is not None and run.finished:
-        found = _finished_rows(path, run.stamp, address, may_show=may_show)
+        found = _finished_rows(path, run.stamp, run.key, may_show=may_show)
     if path is None or found is not None:
         rows, traced = found or ([], None)
     else:
         known = reader.submits(path)
         summaries = {each.summary.submit_index: each.summary for each in known}
-        rows, traced = submit_rows(list(map(_submit, known)), summaries, href=address), None
+        rows, traced = submit_rows(list(map(_submit, known)), summaries, href=_address(run.key)), None
     view = run_view(
         rows,
         entry=run.entry,
@@ -85,10 +85,10 @@ def live_run_view(
 
 @lru_cache(maxsize=8)
 def _finished_rows(
-    folder: Path, stamp: tuple[int, int], address: str, *, may_show: bool
+    folder: Path, stamp: tuple[int, int], key: str, *, may_show: bool
 ) -> tuple[list[SubmitRow], Trace | None] | None:
     """The rows of a finished run as a report has them; None for a run that a report leaves out. `stamp`: of its record,
-    `address`: of a submit, with `{}` for its index."""
+    `key`: in addresses."""
     try:
         traced = trace(read_run(folder))
         rows = submit_rows(
@@ -98,11 +98,15 @@ def _finished_rows(
             folder=folder,
             selected=traced.run.record.outcome.best_submit_index,
             may_show=may_show,
-            href=address,
+            href=_address(key),
         )
     except Exception:  # an agent wrote the files; the rows then have what their summaries have
         return None
     return rows, traced
+
+
+def _address(key: str) -> Callable[[Shown], str]:
+    return lambda submit: f"/run/{key}/submit/{submit.index}"
 
 
 def _submit(one: Submit) -> Shown:

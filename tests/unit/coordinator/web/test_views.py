@@ -174,3 +174,30 @@ def test_a_replay_names_its_run_on_the_pages(tmp_path: Path) -> None:
     assert "Replay of run <code>&lt;b&gt;gone&lt;/b&gt;</code>, which is not here" in pages[2]
     assert found.count("<tr id=") == 2
     assert ", replay of r-first</td>" in found
+
+
+def test_a_runs_page_hides_its_selection_while_a_related_agent_may_live(tmp_path: Path) -> None:
+    """Attack: an agent with a browser reads from an earlier run's page which submit the hidden cases selected."""
+    folder = finished_run(tmp_path / "a")
+    with client(site_of(tmp_path / "a")) as browser:
+        shown = browser.get(f"/run/{key(folder)}").text
+    live = open_run(tmp_path / "b")
+    (live / ".gateway" / "unwatched").touch()
+    with client(site_of(tmp_path / "a", tmp_path / "b")) as browser:
+        hidden = browser.get(f"/run/{key(folder)}").text
+    for text in (">selected</span>", "validation mean -111.2", 'id="phases"', "4242"):
+        assert text in shown, text
+        assert text not in hidden, text
+    for page in (shown, hidden):
+        assert page.count("best so far</b>") == 1
+        assert "train mean <b>-100</b>" in page
+
+
+def test_an_agent_has_one_look_on_all_pages(tmp_path: Path) -> None:
+    folders = [finished_run(tmp_path, entry=entry) for entry in ("Agent A", "Agent B", "Agent C")]
+    with client(site_of(tmp_path)) as browser:
+        rows = browser.get("/").text.split("<tr")
+        for folder, entry in zip(folders, ("Agent A", "Agent B", "Agent C"), strict=True):
+            heading = browser.get(f"/run/{key(folder)}").text.partition("<h1")[2].partition("</h1>")[0]
+            (mark,) = re.findall(r'<path d="([^"]+)" fill="([^"]+)"', heading)
+            assert any(f">{entry}</a>" in row and f'd="{mark[0]}" fill="{mark[1]}"' in row for row in rows)
