@@ -126,7 +126,13 @@ def _of_returns(suite: Suite) -> Leader:
         lead += f"; random actions return {number(random)}"
     better = {other for other, pair in pairs.items() if getattr(pair, str(pair.verdict), "") == first}
     tied = [entry for entry in agents[1:] if entry not in better]
-    return Leader(suite=suite.title, entry=first, lead=f"{lead}.", apart=_apart(tied, len(agents) - 1))
+    few = [entry for entry in tied if entry in pairs and pairs[entry].verdict == "too few runs"]
+    tied = [entry for entry in tied if entry not in few]
+    texts = [] if few and not tied else [_apart(tied, len(agents) - 1 - len(few))]
+    if few:
+        needed = max(pairs[entry].n_needed or 0 for entry in few)
+        texts.append(f"Too few runs for a verdict on {_names(few)}; about {needed} of each would do.")
+    return Leader(suite=suite.title, entry=first, lead=f"{lead}.", apart=" ".join(texts))
 
 
 def _other(pair: Pair, entry: str) -> list[str]:
@@ -156,15 +162,13 @@ def _cost(runs: Sequence[Run]) -> str:
     costs = [each.cost for each in known if each.cost is not None]
     episodes = sum(run.submits[-1].consumed for run in runs if run.submits)
     wall = sum(run.record.timing.wall_time_seconds for run in runs)
-    parts = [f"{episodes:,} train episodes", f"{duration(wall)} of run time in total"]
+    parts = [counted(episodes, "train episode"), f"{duration(wall)} of run time in total"]
     if known:
         total = sum(each.total for each in known)
         parts.append(f"{total / 1e6:,.1f} million tokens" if total >= 1e6 else f"{total:,} tokens")
     if costs:
-        parts.append(
-            f"${sum(costs):,.2f}"
-            + (f" in {len(costs)} of {len(runs)} runs" if len(costs) < len(runs) else "")
-        )
+        of = f" (known for {len(costs)} of {len(runs)} runs)" if len(costs) < len(runs) else ""
+        parts.append(f"${sum(costs):,.2f}{of}")
     return ", ".join(parts) + ("." if costs else "; no run records what its model cost.")
 
 
@@ -199,11 +203,8 @@ def _troubles(study: Study, cells: Sequence[Cell]) -> Iterable[str]:
     if study.mixtures:
         yield f"The runs differ in settings that a comparison holds fixed: {'; '.join(map(str, study.mixtures))}."
     if single := [cell for cell in cells if cell.n_runs == 1]:
-        yield (
-            f"{len(single)} of {counted(len(cells), 'cell')} have one run: how an agent's runs vary is not known"
-            f" there, and"
-            " checkpoints are compared, not agents."
-        )
+        of = "Every cell has" if len(single) == len(cells) else f"{len(single)} of {len(cells)} cells have"
+        yield f"{of} one run: this compares checkpoints, not agents, as one run does not show how an agent's runs vary."
     for cell in [cell for cell in cells if cell.repeated][:_NAMED]:
         yield f"{cell.entry} on {title_of(cell.env)}: {cell.repeated}."
     for holds, text in _REMARKS:
