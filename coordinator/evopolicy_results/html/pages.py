@@ -22,7 +22,7 @@ from evopolicy_results.studies.answers import answers_of
 from evopolicy_results.studies.palette import Look
 from evopolicy_results.studies.study import Study
 from evopolicy_results.tables.report_tables import MEANS
-from evopolicy_results.tables.table import Column, Table, shown
+from evopolicy_results.tables.table import Column, Table, texts_of
 
 _FILTER_FROM = 9
 """Number of rows from which a table has a filter."""
@@ -189,6 +189,7 @@ def table_view(table: Table, pages: Mapping[str, str] = {}) -> dict[str, Any]:
         c for c in table.columns if not table.rows or any(row.get(c.key) is not None for row in table.rows)
     ]
     titles = [escape(visible(column.title)).replace(" /", Markup("&nbsp;/")) for column in columns]
+    texts = [texts_of(table, column) for column in columns]
     runs = table.runs or [""] * len(table.rows)
     brief, _, method = table.caption.partition("? ")
     if method:
@@ -213,26 +214,24 @@ def table_view(table: Table, pages: Mapping[str, str] = {}) -> dict[str, Any]:
                 _cell(
                     column,
                     row.get(column.key),
-                    table.marks.get((number, column.key), 0),
+                    table.marks.get((place, column.key), 0),
                     pages.get(run),
-                    table.digits.get((number, column.key)),
+                    own[place],
                 )
-                for column in columns
+                for column, own in zip(columns, texts, strict=True)
             ]
-            for number, (row, run) in enumerate(zip(table.rows, runs, strict=True))
+            for place, (row, run) in enumerate(zip(table.rows, runs, strict=True))
         ],
     }
 
 
-def _cell(
-    column: Column, value: Any, mark: int, page_of_run: str | None, digits: int | None
-) -> dict[str, Any]:
+def _cell(column: Column, value: Any, mark: int, page_of_run: str | None, text: str) -> dict[str, Any]:
     numeric = column.kind != "text"
     is_long = not numeric and len(str(value)) > _LONG
     classes = {"n": numeric, "first": mark == 1, "second": mark == 2}
     classes |= {"none": value is None and not numeric, "long": is_long}
     return {
-        "text": shown(value, column, digits),
+        "text": text,
         "value": ("" if value is None else value) if numeric else None,
         "cls": " ".join(name for name, holds in classes.items() if holds),
         "href": page_of_run if column.key == "run" else None,

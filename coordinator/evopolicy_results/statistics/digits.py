@@ -8,14 +8,18 @@ from evopolicy_common.statistics.intervals import Estimate
 from evopolicy_common.terminal import number
 
 _MAX_DECIMALS = 6
+_NOTHING = 1e-9
+"""Half width, as a share of the ends, up to which an interval is a rounding error."""
 _SYMMETRIC = 0.1
 """Difference of an interval's two sides, as a share of its half width, up to which it is written with `±`."""
 
 
 def decimals(low: float | None, high: float | None) -> int | None:
     """Decimals that leave two significant digits of the half width; None without bounds, or without a width."""
-    half = 0.0 if low is None or high is None else (high - low) / 2.0
-    if not 0.0 < half < math.inf:
+    if low is None or high is None:
+        return None
+    half = (high - low) / 2.0
+    if not _NOTHING * max(abs(low), abs(high)) < half < math.inf:
         return None
     return min(_MAX_DECIMALS, max(0, 1 - math.floor(math.log10(half))))
 

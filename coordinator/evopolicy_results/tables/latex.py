@@ -15,7 +15,7 @@ from textwrap import wrap
 
 import msgspec
 
-from evopolicy_results.tables.table import DASH, Column, Table, shown
+from evopolicy_results.tables.table import DASH, Column, Table, texts_of
 
 _COLUMNS = 10
 """Columns of a panel, besides those that name its rows."""
@@ -147,10 +147,7 @@ def to_latex(table: Table) -> str:
 
 
 def _column(table: Table, column: Column) -> _Column:
-    texts = [
-        shown(row.get(column.key), column, table.digits.get((place, column.key)))
-        for place, row in enumerate(table.rows)
-    ]
+    texts = texts_of(table, column)
     is_long = column.kind == "text" and max(map(len, texts), default=0) > _LONG
     cells = [
         _MARKED[table.marks.get((number, column.key), 0)].format(_cell(text, column, is_long))

@@ -94,7 +94,7 @@ def _aggregate(suite: Suite, study: Study) -> Table:
             low, high = estimate.score_low, estimate.score_high
             rows[-1] |= {
                 "score_interval": bounds_text(row.score or 0.0, low, high)
-                if low < high
+                if decimals(low, high) is not None
                 else "no spread: the same in each draw",
                 "rank_interval": f"{estimate.rank_low} to {estimate.rank_high}",
                 "ties": estimate.ties,

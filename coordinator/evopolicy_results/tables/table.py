@@ -17,7 +17,7 @@ import msgspec
 from msgspec.structs import replace
 
 from evopolicy_common.statistics.intervals import Estimate
-from evopolicy_common.terminal import csv_cell, one_line
+from evopolicy_common.terminal import csv_cell, number, one_line
 from evopolicy_results.statistics.aggregates import Bounded
 from evopolicy_results.statistics.digits import bounds_text, decimals, rounded
 
@@ -153,12 +153,23 @@ def interval_text(estimate: Estimate | Bounded | None) -> str | None:
     return bounds_text(estimate.value, estimate.low, estimate.high) or estimate.reason or None
 
 
-def shown(value: Any, column: Column, digits: int | None = None) -> str:
-    """`value` as display text. `digits`: decimals that its interval supports; None: the column's."""
+def texts_of(table: Table, column: Column) -> list[str]:
+    """A column's values as display texts. Where intervals give the decimals, a number without one has four digits."""
+    digits = {place: n for (place, key), n in table.digits.items() if key == column.key}
+    values = [row.get(column.key) for row in table.rows]
+    return [
+        _shown(value, column)
+        if not digits or not isinstance(value, int | float)
+        else rounded(value, digits[place])
+        if place in digits
+        else number(value)
+        for place, value in enumerate(values)
+    ]
+
+
+def _shown(value: Any, column: Column) -> str:
     if value is None:
         return DASH
-    if digits is not None and isinstance(value, int | float):
-        return rounded(value, digits)
     if column.kind == "percent":
         return f"{100.0 * value:.0f} %"
     if column.kind == "number" and isinstance(value, int | float):
@@ -184,13 +195,11 @@ def to_markdown(table: Table) -> str:
     lines.append("| " + " | ".join(_pipe(column.title) for column in table.columns) + " |")
     lines.append("|" + "|".join("---" if column.kind == "text" else "---:" for column in table.columns) + "|")
     wrap = {0: "{}", 1: "**{}**", 2: "*{}*"}
-    for number, row in enumerate(table.rows):
+    texts = [texts_of(table, column) for column in table.columns]
+    for place in range(len(table.rows)):
         cells = [
-            wrap[table.marks.get(at, 0)].format(
-                _pipe(shown(row.get(column.key), column, table.digits.get(at)))
-            )
-            for column in table.columns
-            for at in [(number, column.key)]
+            wrap[table.marks.get((place, column.key), 0)].format(_pipe(own[place]))
+            for column, own in zip(table.columns, texts, strict=True)
         ]
         lines.append("| " + " | ".join(cells) + " |")
     return "\n".join(lines) + "\n"

@@ -8,6 +8,7 @@ import json
 from pathlib import Path
 from xml.etree import ElementTree
 
+import msgspec
 import pytest
 from invented.policies import Version, png, policy
 from invented.run_dirs import write_run
@@ -27,7 +28,7 @@ from evopolicy_results.reading.reader import read_run
 from evopolicy_results.studies.palette import looks
 from evopolicy_results.studies.study import study
 from evopolicy_results.tables.report_tables import tables_of
-from evopolicy_results.tables.table import Column, Table, best_marks, shown, to_csv, to_markdown
+from evopolicy_results.tables.table import Column, Table, best_marks, texts_of, to_csv, to_markdown
 
 
 def test_csv_keeps_full_precision_and_empty_fields() -> None:
@@ -84,8 +85,10 @@ def test_markdown_shows_text_and_no_html_links_or_images(text: str, written: str
     ("value", "text"), [(0.0, "0.00"), (0.0001, "<0.01"), (0.0099, "<0.01"), (0.01, "0.01"), (0.014, "0.01")]
 )
 def test_number_too_small_to_show_is_told_from_nought(value: float, text: str) -> None:
-    assert shown(value, Column("x", "X", "number", digits=2, below=True)) == text
-    assert shown(0.0001, Column("x", "X", "number", digits=2)) == "0.00"
+    column = Column("x", "X", "number", digits=2, below=True)
+    table = Table(name="t", title="T", caption="", columns=(column,), rows=({"x": value},))
+    assert texts_of(table, column) == [text]
+    assert texts_of(table, msgspec.structs.replace(column, below=False)) != ["<0.01"]
 
 
 def test_equal_best_values_share_the_mark_and_leave_no_second() -> None:
