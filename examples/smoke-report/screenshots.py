@@ -18,7 +18,8 @@ from PIL import Image
 
 PICK = """(() => { const p = document.getElementById('timeline-picker'); p.value = 'gym/racing';
   p.dispatchEvent(new Event('change')); })()"""
-TO_SECTION = """(() => { const e = document.querySelector(%r); e.scrollIntoView();
+TO_SECTION = """(() => { const e = document.querySelector(%r);
+  e.querySelectorAll(':scope > details').forEach((one) => { one.open = true; }); e.scrollIntoView();
   window.scrollBy(0, -8); return e.id; })()"""
 VIDEOS = """Promise.all([...document.querySelectorAll('video')].map((video) => new Promise((done) => {
   video.preload = 'auto';
