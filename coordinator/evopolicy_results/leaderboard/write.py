@@ -32,7 +32,6 @@ from evopolicy_results.tables.report_tables import tables_of
 _MADE_BY = "Made by evopolicy leaderboard"
 _SHOWN = ("leaderboard", "incomplete", "heldout", "cells", "pairs", "resolution")
 """Tables on the front page, by the first part of their names."""
-_FOLDED = ("cells", "pairs")
 _LONG = 60
 _WORDS = {"ok": "ok", "open": "open", "failed": "FAILED", "": "–"}
 
@@ -168,11 +167,10 @@ def _check(out: Path) -> None:
 def _board(board: Board, study: Study, number: int, folder: str) -> dict[str, Any]:
     views = []
     for table in tables_of(study):
-        kind = table.name.partition("_")[0]
-        if kind in _SHOWN:
+        if table.name in _SHOWN:
             view = table_view(table)
             files = [(label, f"{folder}/{href}") for label, href in view["files"]]
-            views.append({**view, "id": f"{view['id']}-{number}", "files": files, "folded": kind in _FOLDED})
+            views.append({**view, "id": f"{view['id']}-{number}", "files": files})
     suites = ", ".join(suite.title for suite in study.suites)
     name = "Leaderboard" if number == 1 else f"Board {number}"
     reasons_title = "These files stand apart from the first board." if number > 1 else ""

@@ -50,9 +50,7 @@ def index(page: Page, report: Path) -> Page:
     return page
 
 
-def test_the_first_screen_has_the_answers_and_the_picture_and_the_rest_is_folded(
-    page: Page, report: Path
-) -> None:
+def test_the_first_screen_answers_and_the_rest_is_folded(page: Page, report: Path) -> None:
     page.look(width=1280, height=800)
     page.open(report / "index.html")
     bottom = "document.querySelector({!r}).getBoundingClientRect().bottom"

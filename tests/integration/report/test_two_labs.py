@@ -82,7 +82,7 @@ def test_the_labs_have_keys_of_their_own_and_one_board(labs: Path) -> None:
     with Page() as page:
         text = front(page, labs / "site")
         rows = page.run(
-            "[...document.querySelectorAll('#leaderboard-toy-table-1 tbody th')].map((cell) => cell.textContent.trim())"
+            "[...document.querySelectorAll('#leaderboard-table-1 tbody th')].map((cell) => cell.textContent.trim())"
         )
         page.screenshot(labs / "site.png")
     assert set(rows) == {"evolve", "random", "Random policy"}
