@@ -48,7 +48,7 @@ def add_extra(extra: str) -> str:
     pip = (
         f"{python} -m pip install" if importlib.util.find_spec("pip") else f"uv pip install --python {python}"
     )
-    url, is_folder = _source()
+    url, is_folder = source()
     if is_folder:
         from urllib.parse import unquote, urlsplit
 
@@ -63,7 +63,7 @@ def _near(path: str) -> str:
 
 
 @cache
-def _source() -> tuple[str, bool]:
+def source() -> tuple[str, bool]:
     """The URL that pip or uv installed this distribution from, and whether it is a folder."""
     import importlib.metadata
     import json

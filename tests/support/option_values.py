@@ -97,7 +97,7 @@ BASES = {
     "evopolicy-coordinator epoch new": ["--state=state"],
     "evopolicy-worker": ["--env=toy/line"],
     "evopolicy-worker check-env": ["{env}", "--steps=2"],
-    "evopolicy-worker setup": ["{family}", "--into=installed"],
+    "evopolicy-worker setup": ["{family}"],
 }
 """The words of a command that is otherwise right. Where a command has no words here, its required arguments stand
 alone."""

@@ -5,8 +5,8 @@ Packages of some families conflict with those of others. A worker in a separate 
 `installs.toml` has a row for each family: the extra of this software that installs it, a module that shows that it is
 installed, and its versions that differ from `constraints.txt`.
 
-Each virtual environment has a file `MARK` that names its families. `EVOPOLICY_INSTALLS`, or `evopolicy/installs` in the
-user's data folder, contains one entry for each: the virtual environment, or a link to it.
+Each virtual environment has a file `MARK` that names its families. They are in the folder `EVOPOLICY_INSTALLS`, or in
+`evopolicy/installs` in the user's data folder.
 """
 
 from __future__ import annotations
@@ -127,7 +127,7 @@ def advice(env_id: str) -> str:
 
 
 def root() -> Path:
-    """The folder with an entry for each virtual environment of this user."""
+    """The folder with the virtual environments of this user."""
     if named := os.environ.get(FOLDER_VARIABLE):
         return Path(named).absolute()
     data = os.environ.get("XDG_DATA_HOME") or Path.home() / ".local" / "share"
@@ -144,9 +144,9 @@ def read(folder: Path) -> Made | None:
 
 
 def made() -> list[Made]:
-    """The finished virtual environments of this user, the latest first. Skips links to folders that are gone."""
+    """The finished virtual environments of this user, the latest first."""
     try:
-        folders = {each.resolve() for each in root().iterdir()}
+        folders = list(root().iterdir())
     except OSError:
         return []
     ready = [made for each in folders if (made := read(each)) is not None and made.ready]
