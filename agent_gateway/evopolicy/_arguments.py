@@ -5,6 +5,7 @@ from __future__ import annotations
 import difflib
 import math
 import os
+import re
 import reprlib
 from collections.abc import Callable, Iterable, Mapping
 from operator import index
@@ -228,3 +229,18 @@ def check_names(given: Iterable[str], allowed: Iterable[str]) -> None:
             near = difflib.get_close_matches(name, known, 1)
             advice = f"did you mean {near[0]}?" if near else f"there are {', '.join(known)}"
             raise ConfigError(f"unknown argument {name}: {advice}")
+
+
+_KEYWORDS = {
+    one.flag: f"{one.name}=True" if one.type is bool else one.name
+    for one in (*OPTIONS.values(), *declared(run_options.ClusterOptions).values())
+} | {"--policy-package": "policy_packages", "--cases": "cases", "--env": "env"}
+
+
+def in_python(text: str) -> str:
+    """An error's text with keywords in place of options, such as `overwrite=True` for `--overwrite`. Commands in
+    backticks stay."""
+    parts = text.split("`")
+    for n in range(0, len(parts), 2):
+        parts[n] = re.sub(r"(?<![\w-])--[a-z][a-z-]*", lambda flag: _KEYWORDS.get(flag[0], flag[0]), parts[n])
+    return "`".join(parts)

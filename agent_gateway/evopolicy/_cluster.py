@@ -309,9 +309,14 @@ async def _evaluate(
     progress: bool = True,
     policy_packages: Iterable[str] = (),
 ) -> Evaluation:
-    """`Cluster.evaluate` on a temporary local cluster. For several calls, one `Cluster.local` saves repeated starts.
+    """Plays a policy on train cases on a local cluster: `Cluster.evaluate`, which describes the arguments.
 
-    `policy_packages`: as for `Cluster.local`; a policy in a run's directory by default gets the packages of its run.
+    `env`: an environment's id; `evopolicy envs` and docs/reference/environments.md list them. `cases`: train ids, by
+    default 0 to 3; one id is one episode. `policy_packages`: as for `Cluster.local`; a policy in a run's directory by
+    default gets the packages of its run.
+
+    The call costs no budget and asks no model. It starts a coordinator and a worker and ends them, which takes a few
+    seconds: for several calls, open one `Cluster.local`. `slots` episodes are played at once, each on one core.
     """
     trial = await asyncio.to_thread(trial_of, policy, env, cases, tier, limits)
     given = taken(policy=policy, progress=progress, policy_packages=policy_packages)
@@ -331,12 +336,17 @@ async def _run(
     progress: bool = True,
     **options: Unpack[RunOptions],
 ) -> Run:
-    """Plays one whole run, up to its score, on a temporary local cluster.
+    """Plays one whole run, up to its score, on a local cluster.
 
-    `agent`: a function of one `Workspace`, or a text as for `--agent` of `evopolicy run`. A function runs in its own
-    process in the agent's jail, where it can import the standard library and numpy; its own module is sent with it. It
-    returns a JSON-serialisable value, which `Run.value` reads back. `slots`, `policy_packages`: as for `Cluster.local`.
-    `progress`: show the run's progress. `options`: as in `RunOptions`, such as `budget` (train episodes) and `exp_id`.
+    `env`: an environment's id, such as `gym/acrobot`. `agent`: a function of one `Workspace`, or a text as for
+    `--agent` of `evopolicy run`. A function runs in its own process in the agent's jail, where it can import the
+    standard library and numpy; its own module is sent with it. It returns a JSON-serialisable value, which `Run.value`
+    reads back. `slots`, `policy_packages`: as for `Cluster.local`. `progress`: show the run's progress. `options`: as
+    in `RunOptions`, such as `budget` (train episodes) and `exp_id`.
+
+    The run plays `budget` train episodes at most, then the hidden validation cases for each submit, and the hidden
+    held-out cases for the selected checkpoint and for random actions. An agent with a model also costs what its calls
+    cost; `run.json` records it, and `prices` limits it.
 
     Raises ConfigError, with the remedy, for wrong arguments and for missing requirements on this machine. Ctrl-C
     cancels the run, and its folder records that.

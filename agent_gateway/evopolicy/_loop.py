@@ -8,7 +8,9 @@ import threading
 from collections.abc import Callable, Coroutine
 from typing import Any, ParamSpec, TypeVar
 
+from evopolicy._arguments import in_python
 from evopolicy_common.cli.conventions import setup_notices
+from evopolicy_common.errors import ConfigError
 
 T = TypeVar("T")
 P = ParamSpec("P")
@@ -62,6 +64,9 @@ async def awaited(work: Coroutine[Any, Any, T]) -> T:
 async def _notifying(work: Coroutine[Any, Any, T], ended: threading.Event) -> T:
     try:
         return await work
+    except ConfigError as error:
+        error.args = (in_python(str(error)),)
+        raise
     finally:
         ended.set()
 

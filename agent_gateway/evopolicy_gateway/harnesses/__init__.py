@@ -192,6 +192,10 @@ def _split(command: str) -> list[str]:
 def _program(agent: str, words: list[str], started_in: Path) -> list[str]:
     resolved = _absolute(words, started_in)
     if shutil.which(resolved[0]) is None:
+        if os.path.isfile(resolved[0]):
+            raise ConfigError(
+                f"--agent {agent}: {words[0]} is not executable: chmod +x {shlex.quote(words[0])}"
+            )
         raise ConfigError(
             f"--agent {agent}: program {words[0]!r} not found, neither as a file nor on the PATH"
         )

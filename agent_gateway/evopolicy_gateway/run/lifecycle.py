@@ -280,7 +280,8 @@ class RunLifecycle:
         elif self._leaves == "all" and isinstance(error, asyncio.CancelledError):
             await self._tell_gone()
         else:
-            await self._give_up(str(error) if isinstance(error, EvopolicyError) else None)
+            interrupted = record.INTERRUPTED if isinstance(error, asyncio.CancelledError) else None
+            await self._give_up(str(error) if isinstance(error, EvopolicyError) else interrupted)
 
     async def _give_up(self, why: str | None) -> None:
         """Cancels the run at the coordinator, so that no more is played, and records it in `run.json`."""

@@ -12,7 +12,7 @@ from typing import Any
 import msgspec
 
 from evopolicy_common import catalogue
-from evopolicy_common.errors import ConfigError, EvopolicyError
+from evopolicy_common.errors import ConfigError, EvopolicyError, ProtocolError
 from evopolicy_common.messages.environment import StepLimit
 from evopolicy_common.messages.run_settings import RunSettings
 from evopolicy_common.processes.preflight import check_installed, check_loopback, check_text, check_writable
@@ -209,8 +209,12 @@ class Plan(msgspec.Struct, frozen=True, kw_only=True):
                     f"{folder.root} holds a run with other settings; resume it with its original options"
                 )
         elif not (self.resume or self.overwrite):
-            finished = folder.run_json.exists()
-            kind, more = ("a finished", "") if finished else ("an unfinished", ", or resume it with --resume")
+            kind, more = "an unfinished", ", or resume it with --resume"
+            if folder.run_json.exists():
+                kind, more = "a finished", ""
+                with contextlib.suppress(OSError, ProtocolError):
+                    status = read_record(folder.root).outcome.status
+                    kind = {"cancelled": "a cancelled", "error": "a failed"}.get(status, kind)
             raise ConfigError(
                 f"{folder.root} holds {kind} run; choose another --exp-id, or replace it with --overwrite{more}"
             )

@@ -91,6 +91,10 @@ def why_failed(error: Exception, log: Path) -> str:
     return why
 
 
+INTERRUPTED = "interrupted by you (Ctrl-C or SIGTERM)"
+"""The error of a run that its command gave up for that reason."""
+
+
 async def write(
     folder: RunFolder,
     plan: Plan,
@@ -134,7 +138,8 @@ async def write(
             files = checkpoints.without_metadata(selected.files)
             await asyncio.to_thread(_put_in_place, folder.system, files)
     if error is not None and finished.status == "cancelled":
-        finished = msgspec.structs.replace(finished, status="error", error=error)
+        status = "cancelled" if error == INTERRUPTED else "error"
+        finished = msgspec.structs.replace(finished, status=status, error=error)
     known: dict[str, Any] = {"code": code}
     with optional("the recordings of held-out episodes"):
         known["replays"] = await replays.fetch(folder.root, finished, operations)

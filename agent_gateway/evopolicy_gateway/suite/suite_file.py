@@ -7,12 +7,14 @@ from the agent's `[agents.run]`, else from `[defaults]`, else from the environme
 from __future__ import annotations
 
 import contextlib
+import difflib
 import fnmatch
+import re
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from importlib import resources
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, get_args
 
 import msgspec
 from msgspec import Meta
@@ -21,7 +23,7 @@ from evopolicy_common import catalogue
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.regular_files import read_given
 from evopolicy_common.wire import keys
-from evopolicy_gateway.declared import Count, suite_keys
+from evopolicy_gateway.declared import Count, literals, suite_keys
 from evopolicy_gateway.harnesses.interface.agent_config import AgentConfig
 from evopolicy_gateway.jail.settings import JailSettings
 from evopolicy_gateway.run.plan import Plan, check_apart
@@ -121,8 +123,11 @@ def _found(name: str) -> bytes:
 
 def read(name: str) -> SuiteFile:
     """Reads and validates a suite's file. Raises ConfigError with the problem and its place."""
+    data = _found(name)
     try:
-        suite = msgspec.toml.decode(_found(name), type=SuiteFile)
+        suite = msgspec.toml.decode(data, type=SuiteFile)
+    except msgspec.ValidationError as error:
+        raise ConfigError(f"{name}{_explained(str(error), data.decode())}") from error
     except (msgspec.DecodeError, UnicodeDecodeError) as error:
         raise ConfigError(f"{name}: {error}") from error
     if not keys.valid_name(suite.name) or len(suite.name) > 40:
@@ -130,6 +135,32 @@ def read(name: str) -> SuiteFile:
     if not suite.agents or not suite.environments:
         raise ConfigError(f"{name}: at least one agent and one environment are needed")
     return suite
+
+
+_TABLES = (SuiteFile, AgentTable, RunTable, Override, Parallel, Caps, JailSettings, AgentConfig)
+
+
+def _explained(problem: str, text: str) -> str:
+    """A fault that msgspec names, with the line of its key, the nearest known key, or the values that are allowed."""
+    unknown = re.search(r"unknown field `([^`]*)`", problem)
+    key = unknown[1] if unknown else problem.rpartition(".")[2].strip("`")
+    numbers = [
+        n for n, line in enumerate(text.splitlines(), 1) if re.match(rf"\s*\W*{re.escape(key)}\b", line)
+    ]
+    place = f", line {numbers[0]}" if len(numbers) == 1 else ""
+    known = {field.encode_name: field.type for table in _TABLES for field in msgspec.structs.fields(table)}
+    if unknown:
+        near = difflib.get_close_matches(key, known, 1)
+        return f"{place}: {problem}" + (f"; did you mean {near[0]}?" if near else "")
+    allowed = _allowed(known.get(key))
+    return f"{place}: {problem}" + (f"; use one of {', '.join(allowed)}" if allowed else "")
+
+
+def _allowed(kind: Any) -> list[str]:
+    """The values of the Literals in a type."""
+    if found := literals(kind):
+        return [*map(repr, found)]
+    return [each for part in get_args(kind) for each in _allowed(part)]
 
 
 def expand(suite: SuiteFile, root: Path, started_in: Path, only: tuple[str, ...] = ()) -> list[Plan]:

@@ -6,6 +6,7 @@ _WORDS = {
     "no_ok_submit": "no working submit",
     "error": "failed",
     "silent": "agent silent",
+    "told": "stopped by its command",
     "wall_limit": "time limit reached",
 }
 

@@ -101,6 +101,7 @@ def test_an_interrupted_local_command_takes_everything_down(tmp_path: Path, numb
         assert running.alive() == []
     outcome = record_in(run_dir(tmp_path)).outcome
     assert (outcome.status, outcome.closed_reason) == ("cancelled", "cancelled")
+    assert outcome.error == "interrupted by you (Ctrl-C or SIGTERM)"
     assert not (run_dir(tmp_path) / ".gateway").exists()
 
 

@@ -220,6 +220,12 @@ def test_a_replay_without_policies_is_refused_before_a_run_is_opened(tmp_path: P
         harness.check("gym/acrobot")
 
 
+def test_a_program_that_is_not_executable_is_said_to_be_so(tmp_path: Path) -> None:
+    (tmp_path / "agent.py").write_text("#!/usr/bin/env python3\n")
+    with pytest.raises(ConfigError, match=r"agent.py is not executable: chmod \+x ./agent.py"):
+        make("command:./agent.py", tmp_path)
+
+
 def test_a_script_of_the_workspace_may_be_missing_here(tmp_path: Path) -> None:
     make("command:python3 system/policy.py --log out.json", tmp_path)
 

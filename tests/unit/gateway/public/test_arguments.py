@@ -76,7 +76,7 @@ def test_a_wrong_argument_is_named(call: str, name: str, value: Any, tmp_path: P
         ({"budgets": 8}, "unknown argument budgets: did you mean budget"),
         ({"policy_packages": ("no-such-package",)}, "'no-such-package' is not installed"),
         ({"agent": "replay:nowhere"}, "is not a folder"),
-        ({"profile": "published"}, "give --data"),
+        ({"profile": "published"}, "profile published plays .*: give data FOLDER"),
     ],
     ids=str,
 )
@@ -85,6 +85,13 @@ def test_a_run_that_cannot_be_played_starts_no_cluster(
 ) -> None:
     with pytest.raises(evp.ConfigError, match=text):
         evp.run(**({"runs": tmp_path / "runs"} | RUN | wrong))
+
+
+def test_errors_name_keywords_in_place_of_options(tmp_path: Path) -> None:
+    (tmp_path / "runs/random/toy_line/t").mkdir(parents=True)
+    (tmp_path / "runs/random/toy_line/t/run.json").write_text("{}")
+    with pytest.raises(evp.ConfigError, match="choose another exp_id, or replace it with overwrite=True"):
+        evp.run(**({"runs": tmp_path / "runs", "exp_id": "t"} | RUN))
 
 
 def test_a_missing_folder_of_case_files_is_refused(tmp_path: Path) -> None:

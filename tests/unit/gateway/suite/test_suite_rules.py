@@ -110,7 +110,11 @@ def test_operational_settings_do_not_make_another_run(tmp_path: Path) -> None:
     ("text", "message"),
     [
         ("name = 's'", "environments"),
-        (FILE.replace("budget = 8", "budgte = 8"), "budgte"),
+        (FILE.replace("budget = 8", "budgte = 8"), r"line \d+: .*`budgte` .*; did you mean budget\?"),
+        (
+            FILE.replace("budget = 8", 'video = "some"'),
+            r"line \d+: .*'some'.*; use one of 'off', 'first', 'all'",
+        ),
         (FILE.replace("budget = 8", "budget = 0"), "budget"),
         (
             FILE.replace("budget = 8", "limits = { act_wall = 1 }"),

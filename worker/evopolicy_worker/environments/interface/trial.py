@@ -199,7 +199,8 @@ def play(environment: Environment) -> None:
         raise
     except BaseException as error:  # such as an environment's sys.exit
         wanted = "seed" if call.what == "reset" else "action of its action_space"
-        raise WorkerError(f"{call}: it raised {described(error)}; it has to take any {wanted}") from error
+        remedy = "" if isinstance(error, OSError) else f"; it has to take any {wanted}"
+        raise WorkerError(f"{call}: it raised {described(error)}{remedy}") from error
 
 
 def _steps(environment: Environment, seed: int) -> Iterator[Step]:
