@@ -99,7 +99,7 @@ def test_what_is_no_program_is_named_before_anything_starts(
 
 @pytest.mark.parametrize(
     ("program", "code", "told"),
-    [("/bin/true", 1, "/bin/true does not start as a browser"), ("/nonexistent", 1, "/nonexistent")],
+    [("/bin/true", 1, "/bin/true does not start as a browser"), ("/nonexistent", 2, "/nonexistent")],
 )
 def test_a_command_says_it_too(program: str, code: int, told: str) -> None:
     command = [sys.executable, "-P", "-m", "evopolicy_worker.cli", "check-env", ENV]

@@ -186,4 +186,4 @@ def test_an_open_run_is_taken_over_by_a_gateway_started_by_hand(operator_file: P
     finally:
         by_hand.kill()
         by_hand.communicate()
-    assert '"closed"' in (folder / ".gateway" / "journal.jsonl").read_text()
+    assert RunFolder(folder).closing.exists()
