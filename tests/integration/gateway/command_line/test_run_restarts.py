@@ -134,7 +134,9 @@ patient_submit([2, 3], "two")
         command(tmp_path, *arguments[:-2], str(other_file), "--resume") as elsewhere,
     ):
         assert elsewhere.finish()[0] == 0
-    assert f"the cluster has no run {record.run}, so that nothing" in " ".join(elsewhere.text.split())
+    assert f"the cluster has no result of run {record.run}, so that nothing" in " ".join(
+        elsewhere.text.split()
+    )
     assert (run_dir(tmp_path) / "run.json").read_bytes() == before
 
 
