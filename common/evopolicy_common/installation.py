@@ -13,7 +13,7 @@ from pathlib import Path
 
 COMMANDS = (
     "accept-worlds|backup|certs|check|check-env|countersign|data|demo|diff|disk|doctor|envs|epoch|export|files"
-    "|finish|gc|harbor|identity|leaderboard|local|publish|replay|report|rescore|router-config|run|runs"
+    "|finish|gc|harbor|identity|leaderboard|local|move|publish|replay|report|rescore|router-config|run|runs"
     "|setup|status|suite|try|verify|web|workers"
 )
 """First words of our programs' commands, as a pattern."""

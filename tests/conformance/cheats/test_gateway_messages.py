@@ -139,8 +139,8 @@ ALLOWED: dict[str, dict[str, str]] = {
     "BlobRef": {"digest": "str", "size": "int", "inline": "bytes | none"},
     "SubmitDone": {
         "status": (
-            "'budget_invalid' | 'cancelled' | 'denied_import' | 'import_error' | 'init_error' | 'invalid_env_instance'"
-            " | 'missing_policy' | 'ok' | 'rollout_timeout'"
+            "'cancelled' | 'denied_import' | 'import_error' | 'init_error' | 'missing_policy' | 'ok'"
+            " | 'rollout_timeout'"
         ),
         "n_episodes": "int",
         "env_instances": "[int]",

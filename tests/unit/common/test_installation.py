@@ -86,6 +86,6 @@ def test_an_extra_is_added_from_the_clone_or_from_the_wheels_file(monkeypatch: p
     assert add_extra("llm").endswith("install -e '.[llm]'")
     monkeypatch.chdir("/")
     assert add_extra("llm").endswith(f"install -e '{clone}[llm]'")
-    monkeypatch.setattr(installation, "_source", lambda: ("file:///d/evopolicy-1-py3-none-any.whl", False))
+    monkeypatch.setattr(installation, "source", lambda: ("file:///d/evopolicy-1-py3-none-any.whl", False))
     assert add_extra("llm").endswith("install 'evopolicy[llm] @ file:///d/evopolicy-1-py3-none-any.whl'")
     assert Path(add_extra("llm").split()[0]).name.startswith(("python", "uv"))
