@@ -44,10 +44,11 @@ def answers_of(study: Study) -> Answers:
     """The answers about a study."""
     cells = [cell for suite in study.suites for cell in suite.table.cells.values() if cell.fixed is None]
     n_envs = len({cell.env for cell in cells})
+    n_started = sum(run.record.start is not None for run in study.runs)
     scope = [
         counted(len(study.entries), "agent"),
         counted(n_envs, "environment"),
-        counted(len(study.runs), "run"),
+        counted(len(study.runs), "run") + (f" ({n_started} of these from a submit)" if n_started else ""),
     ]
     if cells:
         scope.append(f"{_spread((cell.n_runs for cell in cells), 'run')} a cell")

@@ -186,7 +186,7 @@ def test_the_dockerfile_copies_what_there_is_and_installs_what_was_tested(tmp_pa
     extras = re.search(r"'\.\[(.+)\]'", install)
     assert extras is not None
     rooms = set(extras[1].split(","))
-    assert rooms == {"coordinator", "gateway", "worker"}
+    assert rooms == {"coordinator", "cluster", "gateway", "worker"}
     assert rooms <= set(project["project"]["optional-dependencies"])
     assert "-c constraints.txt" in install
     for source in copied:

@@ -182,8 +182,6 @@ def test_a_listener_has_the_address_that_the_operator_named() -> None:
         ("remote --http-url https://gym.example", "needs"),
         ("evolve --agent-host elsewhere", "applies only with --agent remote"),
         ("remote --http 127.0.0.1:0 --agent-host my-laptop", "boot_id"),
-        ("evolve --hidden-isolation off", "evopolicy-coordinator --hidden-isolation"),
-        ("evolve --local --hidden-isolation none", "'related', 'strict', 'off'"),
         ("evolve --set hidden_cases=mine", "'shared', 'per-run'"),
     ],
 )

@@ -114,12 +114,15 @@ def array_of(schema: SpaceSchema) -> tuple[tuple[int, ...], np.dtype[Any]]:
 
 
 def bounds(schema: SpaceSchema) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Lowest and highest value of every element of a Box or Image, float64 arrays of its shape."""
+    """Lowest and highest value of every element of a Box or Image, float64 arrays of its shape.
+
+    The schemas that agents get have `min` and `max` in place of `low` and `high` where these would be long.
+    """
     shape = tuple(schema["shape"])
     if schema["type"] == "Image":
         low, high = schema["value_range"]
     else:
-        low, high = schema["low"], schema["high"]
+        low, high = (schema[name] for name in (("low", "high") if "low" in schema else ("min", "max")))
     return _filled(low, shape), _filled(high, shape)
 
 
