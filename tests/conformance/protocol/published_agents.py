@@ -89,12 +89,12 @@ assert task.startswith("# ")
 info = ask("/info")[1]
 assert info["env_meta"]["n_env_instances"] == 1024 and info["state"]["is_finalized"] is False
 for wrong, status in (([], "budget_invalid"), ([0] * 99, "budget_invalid"), ([1024], "invalid_env_instance"),
-                      ("3-1", "budget_invalid"), ([-1], "budget_invalid")):
+                      ("3-1", "invalid_env_instance"), ([-1], "invalid_env_instance")):
     code, answer = submit(wrong)
     assert (code, answer["status"]) == (400, status), (wrong, answer)
-assert ask("/info")[1]["state"] == {"remaining_budget": info["episode_budget"], "n_submits": 5, "is_finalized": False}
+assert ask("/info")[1]["state"] == {"remaining_budget": info["episode_budget"], "n_submits": 0, "is_finalized": False}
 answer = submit("1022-1023,0")[1]
-assert answer["submit_id"] == 5
+assert answer["submit_id"] == 0
 assert answer["summary"]["env_instances"] == [1022, 1023, 0] and answer["is_finalized"] is False
 assert ask("/finalize", {})[0] == 405
 spend_all()
