@@ -200,7 +200,7 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
     failed are tried once more even so."""
     late = time.time() > float(os.environ.get("EVOPOLICY_TESTS_UNTIL", "inf"))
     if late and not item.config.getoption("lf"):
-        pytest.skip("not begun before the time in EVOPOLICY_TESTS_UNTIL: make test-families")
+        pytest.skip("not begun before the time in EVOPOLICY_TESTS_UNTIL: make test-long")
 
 
 def pytest_unconfigure(config: pytest.Config) -> None:
