@@ -75,6 +75,7 @@ class Operator:
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(600)
 def test_an_environment_of_the_workers_alone_goes_from_announcement_to_report(
     tmp_path: Path, coordinator: Coordinator, worker: subprocess.Popen[bytes]
 ) -> None:
