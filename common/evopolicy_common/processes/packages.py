@@ -6,7 +6,7 @@ import functools
 import importlib.util
 import re
 import sys
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from importlib import metadata
 from pathlib import Path
 
@@ -167,20 +167,23 @@ def _distribution(name: str) -> metadata.Distribution | None:
 
 @functools.cache
 def distribution_of(module: str) -> str:
-    """Name of the first installed distribution with that top-level module; empty if there is none.
-
-    The same as `metadata.packages_distributions` has, which makes paths of all installed files: seconds.
-    """
+    """Name of the first installed distribution with that top-level module, as `metadata.packages_distributions` has it;
+    empty if there is none."""
     for distribution in metadata.distributions():
-        if tops := distribution.read_text("top_level.txt"):
-            modules = set(tops.split())
-        else:
-            lines = (distribution.read_text("RECORD") or "").splitlines()
-            paths = (line.strip('"').partition(",")[0] for line in lines)
-            modules = {path.partition("/")[0].removesuffix(".py") for path in paths if path.endswith(".py")}
+        modules = (distribution.read_text("top_level.txt") or "").split() or {
+            path.partition("/")[0].removesuffix(".py")
+            for path in _paths(distribution)
+            if path.endswith(".py")
+        }
         if module in modules:
             return distribution.metadata["Name"]
     return ""
+
+
+def _paths(distribution: metadata.Distribution) -> Iterator[str]:
+    """Paths of its files as texts: objects for the files of all distributions would take seconds."""
+    for line in (distribution.read_text("RECORD") or "").splitlines():
+        yield line.strip('"').partition(",")[0]
 
 
 def _requires(distribution: metadata.Distribution) -> list[str]:
@@ -196,9 +199,7 @@ def _owners() -> dict[str, set[str]]:
     """Distributions by the top-level names of their files."""
     owners: dict[str, set[str]] = {}
     for distribution in metadata.distributions():
-        # The first part alone, as text: paths of all files would take seconds.
-        lines = (distribution.read_text("RECORD") or "").splitlines()
-        for top in {line.strip('"').partition(",")[0].partition("/")[0] for line in lines}:
+        for top in {path.partition("/")[0] for path in _paths(distribution)}:
             if top not in _NOT_IN_SITE and not top.endswith(_NO_CODE):
                 owners.setdefault(top, set()).add(distribution.metadata["Name"])
     return owners

@@ -62,11 +62,12 @@ def submit_rows(
     videos: Mapping[int, str] | None = None,
 ) -> list[SubmitRow]:
     """The rows in order. `traced` and `folder`: of a finished run; `may_show`: whether its hidden results may be shown;
-    `href`: the address of a submit's code, empty where there
-    is none."""
+    `href`: the address of a submit's code, empty where there is none."""
     known, by_index = traced or {}, {submit.index: submit for submit in submits}
-    means = [(submit.mean_return, -submit.index) for submit in submits if submit.status == "ok"]
-    best = max(((mean, index) for mean, index in means if mean is not None), default=(0.0, 1))[1]
+    means = {
+        one.index: one.mean_return for one in submits if one.status == "ok" and one.mean_return is not None
+    }
+    best = max(means, key=lambda index: (means[index], -index), default=None)
     starts = [submit.started_at for submit in submits]
     calls = [""] * len(submits) if folder is None else model_calls.before(folder, starts)
     rows: list[SubmitRow] = []
@@ -78,7 +79,7 @@ def submit_rows(
             SubmitRow(
                 submit=submit,
                 summary=summaries.get(index),
-                is_best=index == -best,
+                is_best=index == best,
                 is_selected=may_show and index == selected,
                 outcome=_outcome(row, by_index) if row is not None and may_show else "",
                 change="; ".join(filter(None, texts)),

@@ -125,7 +125,7 @@ def _of_returns(suite: Suite) -> Leader:
         lead += f", before {agents[1]} with {number(column[agents[1]])}"
     if random is not None:
         lead += f"; random actions return {number(random)}"
-    better = {other for other, pair in pairs.items() if getattr(pair, str(pair.verdict), "") == first}
+    better = {other for other, pair in pairs.items() if _winner(pair) == first}
     tied = [entry for entry in agents[1:] if entry not in better]
     few = [entry for entry in tied if entry in pairs and pairs[entry].verdict == "too few runs"]
     tied = [entry for entry in tied if entry not in few]
@@ -138,6 +138,11 @@ def _of_returns(suite: Suite) -> Leader:
 
 def _other(pair: Pair, entry: str) -> list[str]:
     return [pair.second] if pair.first == entry else [pair.first] if pair.second == entry else []
+
+
+def _winner(pair: Pair) -> str:
+    """Empty where no agent is told apart from the other."""
+    return {"first": pair.first, "second": pair.second}.get(pair.verdict, "")
 
 
 def _turned(pair: Pair, entry: str) -> Estimate | None:
