@@ -16,7 +16,6 @@ from evopolicy_common import catalogue
 from evopolicy_common.catalogue import Wrapper
 from evopolicy_common.messages.episode import ResourceLimits
 from evopolicy_common.records.episodes.rendered import OBSERVATIONS, ROWS, checked_files
-from evopolicy_worker.environments import missing
 from evopolicy_worker.environments.interface.calls import USUAL
 from evopolicy_worker.slots.slot import Slot
 
@@ -55,8 +54,6 @@ def test_the_longest_episode_is_recorded_to_its_limit(
     slots: Slots, name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     env, steps = LONGEST[name]
-    if lacking := missing(env):
-        pytest.skip(f"{env} needs {lacking}")
     monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parent / "endless"))
     entry = msgspec.structs.replace(catalogue.entry(env), id=f"long/{name}", wrappers=(WRAPPER,))
     with slots.running(Slot(None, "bwrap", slots.folder / "long", definitions=(entry,))) as slot:

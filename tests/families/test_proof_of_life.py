@@ -16,7 +16,6 @@ from evopolicy_common import catalogue
 from evopolicy_common.messages.episode import ResourceLimits
 from evopolicy_common.statistics.intervals import over_cases
 from evopolicy_worker import check_env
-from evopolicy_worker.environments import missing
 
 pytestmark = pytest.mark.families
 
@@ -29,8 +28,8 @@ ROLES = {"core16", "core16-worlds", "toy", "breadth", "paper13"}
 @pytest.fixture(autouse=True)
 def _installed(request: pytest.FixtureRequest) -> None:
     proof = request.node.callspec.params["proof"] if hasattr(request.node, "callspec") else None
-    if proof is not None and (lacking := missing(proof.env)):
-        pytest.skip(f"{proof.env} needs {lacking}")
+    if proof is not None:
+        proofs.demand(proof.env)
 
 
 def test_every_family_has_a_row_and_cases_that_nobody_chose() -> None:

@@ -37,8 +37,7 @@ def played(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Command]:
 
 @pytest.mark.parametrize("proof", proofs.together(), ids=lambda proof: proof.family)
 def test_an_agent_plays_a_whole_run(played: tuple[Path, Command], proof: Proof) -> None:
-    if lacking := missing(proof.env):
-        pytest.skip(f"{proof.env} needs {lacking}")
+    proofs.demand(proof.env)
     root, done = played
     folder = run_dir(root, env=proof.env.replace("/", "_"))
     assert (folder / "run.json").is_file(), done.text[-4000:]

@@ -66,7 +66,7 @@ def can_mount() -> bool:
 def test_a_run_is_played_or_refused_on_a_host_with(name: str, tmp_path: Path) -> None:
     if not can_mount():
         pytest.skip(
-            "needs mount namespaces, which cannot be made here: run the tests as root, a container privileged"
+            "needs mount namespaces: make test-system as root, in a container that was started with --privileged"
         )
     host = HOSTS[name]
     command = f"{sys.executable} -m evopolicy_gateway.cli local --env toy/line --agent evolve --budget 2"

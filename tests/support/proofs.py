@@ -9,8 +9,11 @@ import tomllib
 from pathlib import Path
 
 import msgspec
+import pytest
 
 from evopolicy_common.catalogue import installs
+from evopolicy_worker.environments import missing
+from evopolicy_worker.environments.browser import chromium
 
 FOLDER = Path(__file__).resolve().parents[1] / "families"
 N_DRAWN, N_CASES = 32, 16
@@ -56,6 +59,15 @@ def together() -> list[Proof]:
     """The rows of families that share one installation; a family that excludes the others' packages has tests with its
     own."""
     return [each for each in table() if not installs.installs()[installs.family_of(each.env)].pins]
+
+
+def demand(env: str) -> None:
+    """Fails where this installation lacks a package of the environment: `make families` installs them all. Skips
+    where Chromium is missing, which only root can install."""
+    lacking = missing(env)
+    if lacking and lacking == chromium.lacking():
+        pytest.skip(f"{env} needs {lacking}")
+    assert not lacking, f"{env} needs {lacking}"
 
 
 def drawn(family: str) -> list[int]:

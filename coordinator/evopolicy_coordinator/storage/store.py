@@ -143,7 +143,8 @@ class Store:
             db.execute("INSERT INTO meta VALUES ('owner', ?)", (owner,))
 
     def write(self, changed: Iterable[records.Row]) -> None:
-        """Writes all rows in one durable transaction. Raises StorageError when it fails; then no row is stored."""
+        """Writes all rows in one durable transaction. Raises StorageError when it fails; the caller then loads the rows
+        again."""
         with self._transaction(), self._db.batch():
             for row in changed:
                 _write_row(self._db, row)

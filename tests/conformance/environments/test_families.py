@@ -6,13 +6,14 @@ import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import proofs
 import pytest
 from text_checks import faults
 from typer.testing import CliRunner
 
 from evopolicy_common import catalogue
 from evopolicy_worker import check_env, cli
-from evopolicy_worker.environments import Environment, make, missing
+from evopolicy_worker.environments import Environment, make
 from evopolicy_worker.environments.checks import conformance
 
 pytestmark = pytest.mark.families
@@ -93,13 +94,6 @@ def test_the_suite_of_the_papers_families_has_all_their_environments() -> None:
     assert catalogue.resolve(["paper13"]) == [each for each in catalogue.entries() if each in set(paper)]
 
 
-@pytest.fixture(autouse=True)
-def _installed(request: pytest.FixtureRequest) -> None:
-    given = request.node.callspec.params.get("env_id") if hasattr(request.node, "callspec") else None
-    if given is not None and (lacking := missing(given)):
-        pytest.skip(f"{given} needs {lacking}")
-
-
 @pytest.mark.parametrize("env_id", SAMPLE)
 def test_an_environment_keeps_what_the_interface_promises(env_id: str) -> None:
     played = conformance.play(env_id, 40)
@@ -107,16 +101,15 @@ def test_an_environment_keeps_what_the_interface_promises(env_id: str) -> None:
     assert played.limit == catalogue.entry(env_id).max_episode_steps
 
 
-SUITES = sorted(catalogue.suites().keys() & catalogue.families().keys() - {"toy"})
+SUITES = sorted(catalogue.suites().keys() & catalogue.families().keys() - {"toy"} - ELSEWHERE)
 
 
 @pytest.mark.slow
 @pytest.mark.timeout(600)
 @pytest.mark.parametrize("suite", SUITES)
 def test_every_text_of_a_family_is_whole_and_our_own(suite: str) -> None:
-    ids = [each for each in catalogue.suites()[suite].environments if not missing(each)]
-    if not ids:
-        pytest.skip(f"{suite} needs {missing(catalogue.suites()[suite].environments[0])}")
+    ids = catalogue.suites()[suite].environments
+    proofs.demand(ids[0])
     assert {each: found for each in ids if (found := faults(each))} == {}
 
 

@@ -75,8 +75,7 @@ def imported(code: str, argument: str) -> set[str]:
 
 @pytest.mark.parametrize("proof", proofs.together(), ids=lambda proof: proof.family)
 def test_one_family_imports_no_other(proof: proofs.Proof) -> None:
-    if lacking := registry.missing(proof.env):
-        pytest.skip(f"{proof.env} needs {lacking}")
+    proofs.demand(proof.env)
     others = set().union(*SIMULATORS.values()) - SIMULATORS.get(proof.family, set())
     assert imported(MAKES, proof.env) & others == set()
 
