@@ -112,9 +112,14 @@ def test_results_of_actions_are_verified_and_clocks_show_in_second_checks(played
 
 
 def test_a_sample_takes_whole_submits_of_policies_with_that_scope(played: Played) -> None:
-    # 6 of the 10 episodes are hidden: the sample has 1 to 4 of the submit's 4.
-    report = played.verify("submit", "--sample", "7")
-    assert report["episodes"] == 7
+    # 6 of the 10 episodes are hidden: the sample has 1 to 4 of the submit's 4, a part of it in 5 of 6 samples.
     part = "its one policy plays whole submits, of which this sample is a part"
-    not_checked = [found["difference"] for found in report["not_checked"]]
-    assert (report["policy_episodes"], not_checked) in [(0, [part]), (4, [])]
+    for _ in range(8):
+        report = played.verify("submit", "--sample", "7")
+        assert report["episodes"] == 7
+        not_checked = [found["difference"] for found in report["not_checked"]]
+        if report["policy_episodes"] == 0:
+            assert not_checked == [part]
+            return
+        assert (report["policy_episodes"], not_checked) == (4, [])
+    pytest.fail("no sample had a part of the submit")
