@@ -234,7 +234,7 @@ async def _main() -> int:
     for number in (signal.SIGTERM, signal.SIGINT):
         loop.add_signal_handler(number, orders.end)
     ended = await main
-    log.info("agent ended", reason=ended.reason, detail=ended.detail, turns=ended.turns)
+    log.info("agent ended", reason=ended.reason, detail=ended.detail, turns=ended.turns or None)
     emit(ended)
     return 0
 

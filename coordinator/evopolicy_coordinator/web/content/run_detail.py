@@ -368,7 +368,7 @@ _NOT_SHOWN = frozenset({"event", "level", "timestamp", "exception", "exc_info", 
 _EVENTS = {
     "submit accepted": "{submit} accepted: {n_episodes} episodes",
     "submit committed": "{submit} ended: {status}",
-    "agent ended": "The agent ended after {turns} turns: {reason}",
+    "agent ended": "The agent ended: {reason}",
     "run closed": "The run was closed: {reason}",
 }
 """Frequent events in words, by their names in the log."""

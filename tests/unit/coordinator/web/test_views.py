@@ -36,7 +36,7 @@ def worker(name: str, **more: object) -> WorkerStatus:
 
 def test_lost_workers_and_retries_stand_among_a_runs_events(tmp_path: Path) -> None:
     folder = open_run(tmp_path)
-    why = {"reason": "agent_failed", "detail": "Error code: 401", "turns": 0}
+    why = {"reason": "agent_failed", "detail": "Error code: 401", "turns": 3}
     verdict = {"submit": "submit_0003", "status": "import_error", "detail": ""}
     lines = [
         {"event": "agent ended", "timestamp": "2026-01-02T00:00:40Z", **why},
@@ -50,7 +50,7 @@ def test_lost_workers_and_retries_stand_among_a_runs_events(tmp_path: Path) -> N
         page = browser.get(f"/run/{key(folder)}").text
     expected = [
         "1 job failed on worker w-cellar, through no fault of the policy. It is played again, at no charge.",
-        "The agent ended after 0 turns: agent failed: Error code: 401</li>",
+        "The agent ended: agent failed (turns 3): Error code: 401</li>",
         "agent paused for the provider",
         "Worker w-attic was lost with 3 jobs of this run. They are played again, at no charge.",
         "submit 0003 ended: import error</li>",

@@ -117,6 +117,19 @@ def test_a_run_without_a_result_has_no_score(tmp_path: Path, status: str) -> Non
     assert (outcome.error is not None) == (status == "cancelled")
 
 
+@pytest.mark.parametrize(
+    ("status", "named"), [("no_ok_submit", "a finished"), ("error", "a failed"), ("cancelled", "a cancelled")]
+)
+def test_a_taken_folder_says_what_kind_of_run_it_holds(tmp_path: Path, status: str, named: str) -> None:
+    plan = plan_in(tmp_path)
+    plan.claim()
+    done = finished(status=status, final_score=None, best_submit_index=None, heldout_returns=(), submits=())
+    record = run_record(plan, done, None, [], Times())
+    plan.folder.run_json.write_bytes(encode_run_record(record))
+    with pytest.raises(ConfigError, match=f"holds {named} run; choose another --exp-id"):
+        plan.claim()
+
+
 def test_a_runs_folder_is_claimed_once_and_replaced_only_on_demand(tmp_path: Path) -> None:
     first = plan_in(tmp_path)
     first.claim()
