@@ -152,7 +152,8 @@ def _task(
         _cluster(where)
     except EvopolicyError as error:
         # Inspect ends with this line. An error in a sample has a traceback, and `inspect eval` exits with 0.
-        raise PrerequisiteError(Text(f"error: {error}".replace("--state", "-T state"))) from error
+        text = str(error).partition(" (local, try")[0].replace("with state", "with -T state=FOLDER")
+        raise PrerequisiteError(Text(f"error: {text}")) from error
     return Task(
         dataset=dataset,
         setup=open_run(where, options, exp_id or default_exp_id(), entry),

@@ -151,7 +151,8 @@ class ClaimedSweep(Sweep):
             self._view.note(run.name, f"taken over from {self._named(claim.previous)}")
         if decision.kind in ("resume", "finish"):
             taken = bool(claim.previous) or (others and not claim.kept)
-            if taken or await self._operations.phase_of(run.folder) is None:
+            opened = run.folder.opened_run.exists()
+            if taken or (opened and await self._operations.phase_of(run.folder) is None):
                 decision = self._anew(run.name)
         elif claim.previous:
             decision = self._anew(run.name)

@@ -118,7 +118,7 @@ def test_a_full_temporary_folder_is_reported_at_the_start(home: Path, name: str,
     assert "TMPDIR" in output
 
 
-@pytest.mark.parametrize("name", ["run", "local", "suite"])
+@pytest.mark.parametrize("name", ["local", "suite"])
 @pytest.mark.parametrize(
     "how", ["true", "ip link set lo up; ip addr del 127.0.0.1/8 dev lo"], ids=["down", "ipv6 only"]
 )

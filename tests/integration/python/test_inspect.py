@@ -191,7 +191,7 @@ def test_an_error_of_every_sample_ends_inspect_with_one_line(inspect: Path, tmp_
         (tmp_path / "sitecustomize.py").write_text(OFFLINE)
         for more, expected in (
             (away, "set TIKTOKEN_CACHE_DIR to its path"),
-            ({"PYTHONPATH": str(tmp_path)}, "choose another folder with -T state"),
+            ({"PYTHONPATH": str(tmp_path)}, "choose another folder with -T state=FOLDER"),
         ):
             said = start(tmp_path, *command, code=1, **more)
             assert expected in " ".join(said.split())

@@ -43,7 +43,7 @@ def policy(tmp_path: Path) -> str:
 
 
 @pytest.mark.usefixtures("without_bubblewrap")
-@pytest.mark.parametrize("name", ["try", "local", "run", "suite"])
+@pytest.mark.parametrize("name", ["try", "local", "suite"])
 def test_a_command_without_bubblewrap_names_the_remedy(tmp_path: Path, policy: str, name: str) -> None:
     (tmp_path / "t.toml").write_text(
         'name = "t"\nenvironments = ["toy/line"]\n[[agents]]\nname = "e"\nagent = "evolve"\n'
