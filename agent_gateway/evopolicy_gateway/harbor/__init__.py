@@ -1,1 +1,0 @@
-"""Runs of remote agents as tasks for Harbor, which get their reward from the cluster."""

@@ -1,1 +1,0 @@
-"""Skills and MCP servers that an operator declares for an agent: an experiment's variable."""

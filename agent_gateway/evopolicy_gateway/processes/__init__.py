@@ -1,1 +1,0 @@
-"""Processes that the gateway starts and ends, their messages to each other, their logs, and an agent's clock."""

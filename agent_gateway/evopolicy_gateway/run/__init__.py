@@ -1,1 +1,0 @@
-"""One run, from its opening to `run.json`."""

@@ -1,1 +1,0 @@
-"""Submits, from a request's bytes to committed feedback."""

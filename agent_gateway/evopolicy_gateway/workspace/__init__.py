@@ -1,1 +1,0 @@
-"""An agent's workspace before the agent starts."""

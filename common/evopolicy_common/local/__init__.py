@@ -1,1 +1,0 @@
-"""A local cluster: coordinator and workers of one command, as child processes on this machine."""

@@ -1,1 +1,0 @@
-"""Child processes, temporary folders, and the checks of a machine before a command starts."""

@@ -1,1 +1,0 @@
-"""Files that outlive a process: blobs, policies, trajectories, `run.json`, `summary.json`."""

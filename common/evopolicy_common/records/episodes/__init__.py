@@ -1,1 +1,0 @@
-"""An episode as bytes: its trajectory, and the feedback files rendered from it."""

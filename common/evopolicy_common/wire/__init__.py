@@ -1,1 +1,0 @@
-"""Requests between processes: keys, encoding, sessions, credentials, refusals."""

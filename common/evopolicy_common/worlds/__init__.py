@@ -1,1 +1,0 @@
-"""Altered rules of an environment, and policies that undo them."""

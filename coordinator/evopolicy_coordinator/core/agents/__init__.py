@@ -1,1 +1,0 @@
-"""Agents and hidden jobs exclude each other on a kernel: permits, the gateways' requests for them, and precedence."""

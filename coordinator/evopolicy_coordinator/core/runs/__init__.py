@@ -1,1 +1,0 @@
-"""Runs and evaluations, from their creation to their result: submits, results, validation, selection."""

@@ -1,1 +1,0 @@
-"""Requests of workers: membership, polls and the leases granted to them, result reports."""

@@ -1,1 +1,0 @@
-"""Certificates: a cluster's own authority, and the machines that it has admitted."""

@@ -1,1 +1,0 @@
-"""The coordinator's shell around the core: requests in, effects out."""

@@ -1,1 +1,0 @@
-"""Monitoring of a running coordinator: its metrics, and stalls of its event loop."""

@@ -1,1 +1,0 @@
-"""Commands on finished runs: reports, checks, re-scores and published results."""

@@ -1,1 +1,0 @@
-"""`evopolicy leaderboard`: a static site from published results of several labs."""

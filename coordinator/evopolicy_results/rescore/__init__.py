@@ -1,1 +1,0 @@
-"""`evopolicy rescore`: plays finished runs' checkpoints on further hidden cases."""

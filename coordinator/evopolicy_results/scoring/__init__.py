@@ -1,1 +1,0 @@
-"""Scores, ranks and normalised scores, and the paper's own numbers to test them against."""

@@ -1,1 +1,0 @@
-"""The report's tables, as data and as CSV, Markdown and LaTeX."""

@@ -1,1 +1,0 @@
-"""`evopolicy verify`: replays finished episodes and compares the results."""

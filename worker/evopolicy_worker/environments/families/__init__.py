@@ -1,1 +1,0 @@
-"""Families of environments, a module each: what differs from other Gymnasium environments, and the toys."""

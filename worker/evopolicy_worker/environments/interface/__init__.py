@@ -1,2 +1,0 @@
-"""The interface to every environment: spaces, actions, observations and rewards as values, and the Gymnasium
-adapter."""

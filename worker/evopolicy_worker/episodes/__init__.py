@@ -1,1 +1,0 @@
-"""Playing episodes, in the environment process of a slot."""

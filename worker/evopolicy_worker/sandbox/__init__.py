@@ -1,1 +1,0 @@
-"""The jails of environment and policy processes."""
