@@ -89,8 +89,9 @@ libc = ctypes.CDLL(None, use_errno=True)
 NOTES = []
 
 def watch_library():
+    # Opens and closes: one event of a kind after the other, such as two opens, is one event.
     watch = libc.inotify_init1(0o4000)
-    if watch >= 0 and libc.inotify_add_watch(watch, os.path.realpath(sys.executable).encode(), 0x20) >= 0:
+    if watch >= 0 and libc.inotify_add_watch(watch, os.path.realpath(sys.executable).encode(), 0x38) >= 0:
         NOTES.append(watch)
 
 def opens():
