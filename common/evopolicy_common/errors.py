@@ -93,5 +93,9 @@ class StorageError(EvopolicyError):
     """The store could not persist or read data; nothing unpersisted takes effect."""
 
 
+class LeadLostError(StorageError):
+    """Another coordinator writes this store, or may: this one must answer nothing until it leads again."""
+
+
 class DamagedStoreError(StorageError):
     """Stored data cannot be read or contradict each other; a retry does not help."""

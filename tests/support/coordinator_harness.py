@@ -54,6 +54,7 @@ class Coordinator:
         *args: str,
         trust_workers: bool = True,
         program: Sequence[str] = ("-m", "evopolicy_coordinator.cli"),
+        wait: bool = True,
         **environment: str,
     ) -> None:
         self.state = state
@@ -69,6 +70,11 @@ class Coordinator:
                 stderr=log,
                 env={**os.environ, "XDG_STATE_HOME": str(state.parent / "xdg"), **environment},
             )
+        if wait:
+            self.await_ready()
+
+    def await_ready(self) -> None:
+        """Returns once it serves; a standby does when it leads."""
         deadline = time.monotonic() + TIMEOUT_S
         while not self.ready_file.exists():
             if self.process.poll() is not None or time.monotonic() > deadline:

@@ -19,7 +19,7 @@ from collections.abc import Callable
 from math import inf
 from typing import TYPE_CHECKING
 
-from evopolicy_common.errors import DamagedStoreError, PartFailedError, StorageError
+from evopolicy_common.errors import DamagedStoreError, LeadLostError, PartFailedError, StorageError
 from evopolicy_common.logs import structlog
 from evopolicy_coordinator.core.contract.effects import Effect
 from evopolicy_coordinator.core.contract.events import AnyEvent
@@ -40,6 +40,10 @@ _LOADS_MAX = 5
 """Maximum number of reloads after consecutive failures that are not the disk's, each within `_SOON_S` of the one
 before."""
 _SOON_S = 60.0
+LEAD_S = 5.0
+"""A coordinator answers nothing when the database has not confirmed its lead for this long, seconds. A server ends the
+session of a lost machine later than that."""
+_CONFIRM_S = 1.0
 
 
 class CoreHost:
@@ -79,7 +83,12 @@ class CoreHost:
         """Failures of the core, each within `_SOON_S` of the one before."""
         self._failed_at = 0.0
         self.failed: asyncio.Future[None] = self._loop.create_future()
-        """Ends with PartFailedError and the reason when a part of the service cannot continue."""
+        """Ends with PartFailedError and the reason when a part of the service cannot continue, with LeadLostError when
+        another coordinator leads."""
+        self.store_latency_s: float | None = None
+        """How long the database took to confirm the lead, seconds; None in a state folder of its own."""
+        self.leads_until = inf
+        """Monotonic time after which nothing is answered unless the database confirms the lead again."""
         self._unix_offset = time.time() - self._loop.time()
 
     def now(self) -> float:
@@ -135,6 +144,38 @@ class CoreHost:
             self.failed.exception()  # mark as retrieved: nothing may await it, as during the start
         self._forget()
         return failed
+
+    def step_down(self, error: LeadLostError) -> None:
+        """Drops all that is not durable, and answers nothing any more."""
+        self._forget()
+        self.leads_until, self.storage_error, self.last_core = 0.0, "", None
+        if not self.failed.done():
+            self.failed.set_exception(error)
+            self.failed.exception()  # mark as retrieved, as in `fail`
+
+    async def watch_lead(self) -> None:
+        """Has the database confirm every second that this coordinator leads; otherwise steps down."""
+        self.leads_until = time.monotonic() + LEAD_S
+        while not self.failed.done():
+            began = time.monotonic()
+            try:
+                async with asyncio.timeout(max(0.0, self.leads_until - began)):
+                    self.store_latency_s = await self._writer.call(Store.confirm)
+                self.leads_until = began + LEAD_S
+            except LeadLostError as error:
+                self.step_down(error)
+            except (StorageError, TimeoutError) as error:
+                if not self.leads:
+                    why = str(error) or "no answer"
+                    self.step_down(
+                        LeadLostError(f"the database has not confirmed the lead for {LEAD_S:g} s: {why}")
+                    )
+            await asyncio.sleep(_CONFIRM_S)
+
+    @property
+    def leads(self) -> bool:
+        """Whether requests may be answered."""
+        return time.monotonic() < self.leads_until
 
     # Steps.
 
@@ -226,6 +267,9 @@ class CoreHost:
         if not isinstance(error, StorageError):
             self.fail("writing the store", error)
             return
+        if isinstance(error, LeadLostError):
+            self.step_down(error)
+            return
         self.storage_error, self.last_core = str(error), self.core
         self._drop()
         log.error("the store cannot write; requests are refused until it can", error=str(error))
@@ -254,6 +298,9 @@ class CoreHost:
                 await self._load()
             except DamagedStoreError as error:
                 self.fail("loading the state", error)
+                return
+            except LeadLostError as error:
+                self.step_down(error)
                 return
             except StorageError as error:
                 log.error("the store still cannot write", error=str(error))

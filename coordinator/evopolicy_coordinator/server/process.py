@@ -1,6 +1,9 @@
 """One coordinator process: opens all its parts in order and closes them in reverse.
 
 The state folder is locked first and released last. Workers get no replies before the core is loaded.
+
+Of several coordinators on one PostgreSQL database one leads. The others wait, and listen only when they lead. A leader
+that another replaced, or that cannot reach the database for `core_host.LEAD_S`, closes its listeners and waits too.
 """
 
 from __future__ import annotations
@@ -14,7 +17,7 @@ from typing import Any
 import msgspec
 
 from evopolicy_common import catalogue
-from evopolicy_common.errors import ConfigError
+from evopolicy_common.errors import ConfigError, DamagedStoreError, LeadLostError, StorageError
 from evopolicy_common.local.cluster import PROCESSES, WORKERS_ENDED
 from evopolicy_common.logs import structlog
 from evopolicy_common.processes import host
@@ -33,12 +36,15 @@ from evopolicy_coordinator.server.run_requests import RunRequests
 from evopolicy_coordinator.server.service import Service
 from evopolicy_coordinator.server.uploads import Uploads
 from evopolicy_coordinator.splits import SplitSource, load_or_create_secret, secret_of
-from evopolicy_coordinator.storage.engines import checked_address, chosen_place, record_place
+from evopolicy_coordinator.storage.engines import Place, checked_address, chosen_place, record_place
 from evopolicy_coordinator.storage.state_folder import ROLES, StateFolder, reachable, resolve_listen
 from evopolicy_coordinator.storage.store import Store
 from evopolicy_coordinator.worlds import JOURNAL
 
 log: structlog.stdlib.BoundLogger = structlog.get_logger()
+
+_PAUSE_S = 0.1
+"""Between attempts to lead, seconds."""
 
 
 class Options(msgspec.Struct, frozen=True, kw_only=True):
@@ -74,23 +80,55 @@ async def run(options: Options, stop: asyncio.Event, on_ready: Callable[[Ready],
     """
     if options.store is not None:
         checked_address(options.store)  # before anything is created
+    with contextlib.closing(StateFolder.open(options.state, options.cluster)) as state:
+        machines = Machines(state.root)
+        listen = _listen(state, options, machines)
+        place, why = chosen_place(state.root, options.store), ""
+        while not stop.is_set():
+            try:
+                await _lead(options, state, place, machines, listen, stop, on_ready)
+                break
+            except DamagedStoreError:
+                raise
+            except StorageError as error:
+                if not (why or isinstance(error, LeadLostError)):
+                    raise
+                if str(error) != why:
+                    why = str(error)
+                    log.warning("standby: waiting to lead", why=why)
+            await _pause(stop)
+    log.info("stopped; everything is on disk", state=str(state.root))
+
+
+async def _pause(stop: asyncio.Event) -> None:
+    with contextlib.suppress(TimeoutError):
+        async with asyncio.timeout(_PAUSE_S):
+            await stop.wait()
+
+
+async def _lead(
+    options: Options,
+    state: StateFolder,
+    place: Place,
+    machines: Machines,
+    listening: tuple[tuple[str, ...], tuple[str, ...]],
+    stop: asyncio.Event,
+    on_ready: Callable[[Ready], None],
+) -> None:
+    """Serves while this coordinator leads, until `stop`. Raises LeadLostError when another one leads."""
+    listen, remote = listening
     async with contextlib.AsyncExitStack() as opened:
-        state = StateFolder.open(options.state, options.cluster)
-        opened.callback(state.close)
+        store = await asyncio.to_thread(Store, place, state.identity.operator_token)
+        opened.callback(store.close)
         secret, note = secret_of(state.root, unjailed=options.unjailed)
         if options.data is not None:
             note = ""
         elif note:
             log.warning(note)
         source = SplitSource(data=options.data, secret=secret, journal=state.root / JOURNAL)
-        machines = Machines(state.root)
-        listen, remote = _listen(state, options, machines)
         load_or_create_secret(
             state.root / SIGNING_KEY
         )  # now, so that every backup has it: runs are named from it
-        place = chosen_place(state.root, options.store)
-        store = Store(place, state.identity.operator_token)
-        opened.callback(store.close)
         record_place(state.root, place)
         (state.root / PROCESSES).unlink(missing_ok=True)
         ended = state.root / WORKERS_ENDED
@@ -123,6 +161,9 @@ async def run(options: Options, stop: asyncio.Event, on_ready: Callable[[Ready],
             log.info("metrics are served", address=options.metrics, port=port)
         opened.push_async_callback(service.stop)
         await service.start()
+        if isinstance(place, str):
+            watching = asyncio.create_task(service.host.watch_lead())
+            opened.callback(watching.cancel)
         queries, liveliness = service.on_queries, service.on_liveliness
         # Other machines have a listener of their own.
         await opened.enter_async_context(remote_listener(cluster, remote, machines, queries, liveliness))
@@ -145,9 +186,12 @@ async def run(options: Options, stop: asyncio.Event, on_ready: Callable[[Ready],
                 note=note,
             )
         )
-        await _until(stop, service)
+        try:
+            await _until(stop, service)
+        except LeadLostError:
+            store.abort()  # nothing waits for an operation in flight
+            raise
         log.info("stopping")
-    log.info("stopped; everything is on disk", state=str(state.root))
 
 
 async def _until(stop: asyncio.Event, service: Service) -> None:

@@ -168,6 +168,9 @@ class Service:
 
     def _receive(self, query: IncomingQuery) -> None:
         core = self.host.core
+        if not self.host.leads:
+            query.drop()
+            return
         if core is None or self.host.stopping:
             self._turn_away(query)
             return
@@ -463,6 +466,9 @@ class Service:
         if isinstance(effect, Reply | Refuse | ReadEffect):
             pending = self._pending.pop(effect.request, None)
             if pending is None:
+                return
+            if not self.host.leads:
+                pending.query.drop()
                 return
             query, answer = pending.query, answer_to(pending.query, pending.asker)
             if isinstance(effect, ReadEffect):

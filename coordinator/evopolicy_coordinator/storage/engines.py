@@ -6,7 +6,8 @@ Rules that this module owns:
 - A disk or server that refuses may accept a write later (StorageError); contradicting rows and missing tables stay as
   they are (DamagedStoreError).
 - PostgreSQL's writing connection holds an advisory lock of the database for as long as it lives, so that one
-  coordinator writes. A lost connection is opened anew by the next operation, never within a transaction.
+  coordinator leads (LeadLostError for the others). A lost connection is opened anew by the next operation, never
+  within a transaction.
 - Passwords come from libpq's files and environment variables. An address that contains one is refused.
 """
 
@@ -14,12 +15,14 @@ from __future__ import annotations
 
 import abc
 import contextlib
+import os
+import socket
 import sqlite3
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from evopolicy_common.errors import ConfigError, DamagedStoreError, StorageError
+from evopolicy_common.errors import ConfigError, DamagedStoreError, LeadLostError, StorageError
 from evopolicy_common.installation import add_extra
 from evopolicy_common.records.blobs import write_atomically
 from evopolicy_common.wire.credentials import no_state
@@ -36,28 +39,33 @@ DATABASE = "coordinator.sqlite"
 """Name of the SQLite file in a state folder."""
 ADDRESS = "store"
 """Name of the file in a state folder that holds the address of its PostgreSQL database."""
-LOCK_WAIT_S = 15.0
-"""How long a coordinator waits for the database's lock: the server needs some time to notice a lost machine."""
+LOCK_WAIT_S = 4.0
+"""Longest wait for the database's lock in one attempt."""
 
 _NO_CHANGE = "the journal is only appended to"
 _LINK = {
     "connect_timeout": "10",
     "application_name": "evopolicy",
-    "tcp_user_timeout": "10000",
-    "keepalives_idle": "5",
-    "keepalives_interval": "2",
+    "tcp_user_timeout": "6000",
+    "keepalives_idle": "3",
+    "keepalives_interval": "1",
     "keepalives_count": "3",
 }
-"""libpq's settings where the address has none: a lost server is noticed within about ten seconds."""
+"""libpq's settings where the address has none: a lost server is noticed within about six seconds."""
 _SESSION = (
-    "SET tcp_keepalives_idle = 5",
-    "SET tcp_keepalives_interval = 2",
+    "SET tcp_keepalives_idle = 3",
+    "SET tcp_keepalives_interval = 1",
     "SET tcp_keepalives_count = 3",
-    "SET idle_in_transaction_session_timeout = '60s'",
+    "SET tcp_user_timeout = 6000",
+    "SET idle_in_transaction_session_timeout = '20s'",
     f"SET lock_timeout = '{LOCK_WAIT_S:.0f}s'",
 )
-"""The server's side of it: the lock of a lost coordinator is free after as long."""
-_ONE_WRITER = "SELECT pg_advisory_lock(hashtext('evopolicy'), hashtext(current_schema()))"
+"""The server's side of it: the lock of a lost machine is free after as long."""
+_ONE_WRITER = (
+    "SELECT pg_advisory_lock(hashtext('evopolicy'), hashtext(current_schema()))",
+    # A paused coordinator sends nothing, and the server ends its session with the lock.
+    "SET idle_session_timeout = '20s'",
+)
 
 
 class Database(abc.ABC):
@@ -136,6 +144,9 @@ class Database(abc.ABC):
     @abc.abstractmethod
     def close(self) -> None:
         """Closes the connection."""
+
+    def abort(self) -> None:  # noqa: B027 - a file has no connection
+        """Ends the connection from another thread, so that the operation in flight fails."""
 
     @abc.abstractmethod
     def _reconnect(self) -> None: ...
@@ -235,7 +246,7 @@ class Postgres(Database):
     shared = " FOR SHARE"
 
     def __init__(self, address: str, *, writes: bool) -> None:
-        """Raises ConfigError for an address that cannot be used, or a lock that another coordinator keeps,
+        """Raises ConfigError for an address that cannot be used, LeadLostError when another coordinator keeps the lock,
         StorageError when the server cannot be reached."""
         driver = _psycopg()
         self.place = address
@@ -243,15 +254,8 @@ class Postgres(Database):
         self._settings = _settings(address)
         self._driver = driver
         self.raw: psycopg.Connection[tuple[Any, ...]] | None = None
-        try:
-            with self.errors():
-                pass
-        except StorageError as error:
-            if isinstance(error.__cause__, driver.errors.LockNotAvailable):
-                raise ConfigError(
-                    f"{address} is in use by another coordinator: stop it, or name another database"
-                ) from error
-            raise
+        with self.errors():
+            pass
 
     def execute(self, statement: str, args: Iterable[Any] = ()) -> psycopg.Cursor[tuple[Any, ...]]:
         return self._open.execute(_theirs(statement), tuple(args))
@@ -272,6 +276,12 @@ class Postgres(Database):
         if self.raw is not None:
             self.raw.close()
 
+    def abort(self) -> None:
+        raw = self.raw
+        if raw is not None and not raw.closed:
+            with contextlib.suppress(OSError), socket.socket(fileno=os.dup(raw.fileno())) as link:
+                link.shutdown(socket.SHUT_RDWR)
+
     @property
     def _open(self) -> psycopg.Connection[tuple[Any, ...]]:
         if self.raw is None:
@@ -284,8 +294,13 @@ class Postgres(Database):
         self.raw = None
         raw = self._driver.connect(autocommit=True, **self._settings)
         try:
-            for statement in (*_SESSION, *([_ONE_WRITER] if self._writes else ())):
+            for statement in (*_SESSION, *(_ONE_WRITER if self._writes else ())):
                 raw.execute(statement)
+        except self._driver.errors.LockNotAvailable as error:
+            raw.close()
+            raise LeadLostError(
+                f"{self.place} is in use by another coordinator: stop it, or name another database"
+            ) from error
         except BaseException:
             raw.close()
             raise

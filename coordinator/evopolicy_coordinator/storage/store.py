@@ -18,12 +18,13 @@ import contextlib
 import hashlib
 import itertools
 import operator
+import time
 from collections.abc import Callable, Iterable, Iterator
 from typing import Any, NamedTuple, TypeVar, get_args
 
 import msgspec
 
-from evopolicy_common.errors import DECODE_ERRORS, ConfigError, DamagedStoreError, StorageError
+from evopolicy_common.errors import DECODE_ERRORS, ConfigError, DamagedStoreError, LeadLostError
 from evopolicy_common.messages.episode import BlobRef, EpisodeOutcome
 from evopolicy_common.messages.operator import RunFinished
 from evopolicy_common.records.splits import SPLITS
@@ -111,7 +112,8 @@ class Store:
     def __init__(self, place: Place, owner: str = "") -> None:
         """Opens or creates the database. `owner`: a secret of the state folder, whose digest is kept.
 
-        Raises ConfigError for another schema or the database of another state folder, StorageError."""
+        Raises ConfigError for another schema or the database of another state folder, LeadLostError while another
+        coordinator leads, StorageError."""
         self._db = connect(place, "rwc", BUSY_TIMEOUT_S)
         self._incarnation = 0
         try:
@@ -151,12 +153,24 @@ class Store:
 
     @contextlib.contextmanager
     def _transaction(self) -> Iterator[None]:
-        """A durable transaction. Raises StorageError when another coordinator has loaded the rows since `load`."""
+        """A durable transaction. Raises LeadLostError when another coordinator has loaded the rows since `load`."""
         with self._db.errors(), self._db.transaction():
             query = f"SELECT value FROM meta WHERE name = 'incarnation'{self._db.shared}"
             if self._incarnation and self._db.execute(query).fetchone() != (self._incarnation,):
-                raise StorageError(f"{self._db.place}: another coordinator has taken over")
+                raise LeadLostError(f"{self._db.place}: another coordinator has taken over")
             yield
+
+    def confirm(self) -> float:
+        """How long the database takes to confirm that this coordinator leads, seconds. Raises LeadLostError,
+        StorageError."""
+        began = time.monotonic()
+        with self._transaction():
+            pass
+        return time.monotonic() - began
+
+    def abort(self) -> None:
+        """Lets the operation of another thread fail."""
+        self._db.abort()
 
     def forget_kernels(self, boot_id: str) -> None:
         """Durably deletes the records of which workers were on that kernel: those workers are known to have ended."""

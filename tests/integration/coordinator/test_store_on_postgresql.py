@@ -15,7 +15,7 @@ import pytest
 from coordinator_harness import Coordinator, bundle_of, comparable, gateway_of, operator_of, run, working
 from machines.postgres import Server
 
-from evopolicy_common.errors import ConfigError, RefusedError, StorageError
+from evopolicy_common.errors import ConfigError, LeadLostError, RefusedError, StorageError
 from evopolicy_common.messages.operator import RunCreated
 from evopolicy_coordinator.storage import backup, disk_use
 from evopolicy_coordinator.storage.engines import DATABASE, connect, place_of
@@ -234,7 +234,7 @@ def test_one_coordinator_at_a_time_uses_a_database(
     address = server.new()
     monkeypatch.setattr("evopolicy_coordinator.storage.engines._SESSION", ("SET lock_timeout = '100ms'",))
     with contextlib.closing(Store(address, "one")) as ours:
-        with pytest.raises(ConfigError, match="in use by another coordinator"):
+        with pytest.raises(LeadLostError, match="in use by another coordinator"):
             Store(address, "one")
         # Its session is gone, and another coordinator has the lock.
         ours.load()
@@ -247,7 +247,7 @@ def test_one_coordinator_at_a_time_uses_a_database(
             for _ in range(2):
                 with pytest.raises(StorageError):
                     ours.write([])
-        with pytest.raises(StorageError, match="another coordinator has taken over"):
+        with pytest.raises(LeadLostError, match="another coordinator has taken over"):
             ours.write([])
     with pytest.raises(ConfigError, match="of another state folder"):
         Store(address, "two")
