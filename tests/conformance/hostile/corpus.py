@@ -111,9 +111,9 @@ def document() -> str:
         first = (POLICIES / f"{probe.name}.py").read_text().split('"""')[1].rstrip(".")
         undefended = {"tier": "with tier `none`", "sealed": "unsealed"}
         off = "-" if probe.off is None else undefended["sealed" if "sealed" in probe.off else "tier"]
-        rows.append((first, "no access; the episode goes on", off))
+        rows.append((first, "no access; the episode continues", off))
     for breaker in BREAKERS:
-        verdict = f"`{breaker.verdict}`" if breaker.verdict else "harmless; the episode goes on"
+        verdict = f"`{breaker.verdict}`" if breaker.verdict else "harmless; the episode continues"
         ways = ["unsealed"] * breaker.unsealed + ["with a higher limit"] * (breaker.off is not None)
         ways += ["in the environment's process"] * breaker.in_process
         rows.append((breaker.name, verdict, ", ".join(ways) or "-"))

@@ -1,4 +1,4 @@
-"""Cards and their descriptions: the shipped example, and the bytes that a check compares."""
+"""Cards and their descriptions: an example, and the bytes that a check compares."""
 
 from __future__ import annotations
 
@@ -10,18 +10,17 @@ import pytest
 from evopolicy_results.publish import card as cards
 from evopolicy_results.publish import contents, descriptions
 
-PAGES = Path(__file__).parents[3] / "docs" / "explanation"
-PAGE = PAGES / "card-example.md"
+EXAMPLE = Path(__file__).with_name("card-example.json")
 
 
 @pytest.fixture
 def example() -> cards.Card:
-    return msgspec.json.decode((PAGES / "card-example.json").read_bytes(), type=cards.Card)
+    return msgspec.json.decode(EXAMPLE.read_bytes(), type=cards.Card)
 
 
-def test_the_example_in_the_documentation_is_a_cards_text(example: cards.Card) -> None:
-    assert PAGE.read_text().endswith(descriptions.markdown(example))
-    assert contents.document(example) == (PAGES / "card-example.json").read_bytes()
+def test_the_example_is_a_cards_text(example: cards.Card) -> None:
+    assert EXAMPLE.with_suffix(".md").read_text() == descriptions.markdown(example)
+    assert contents.document(example) == EXAMPLE.read_bytes()
 
 
 def test_the_same_card_gives_the_same_descriptions(example: cards.Card) -> None:
