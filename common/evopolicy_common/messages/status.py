@@ -167,3 +167,7 @@ class StatusReply(Message, frozen=True, kw_only=True, tag="status_reply"):
     """CPU seconds that the coordinator spent on its previous status reply; 0.0 before the first."""
     trouble: Text = ""
     """Why the coordinator accepts no changes; the rest is as of then. Empty: it accepts them."""
+    host: Word = ""
+    """The machine of the coordinator; of several on one database, the leader's."""
+    store_latency_s: Number | None = None
+    """How long the database took to confirm the lead; None where the rows are in a file."""

@@ -24,7 +24,7 @@ from evopolicy_common.messages.status import RunStatus, StatusReply, WorkerStatu
 from evopolicy_common.terminal import counted, duration, say, say_json
 from evopolicy_common.wire import credentials, transport
 from evopolicy_common.wire.operator_client import OperatorClient
-from evopolicy_coordinator.web.content.remarks import remarks
+from evopolicy_coordinator.web.content.remarks import remarks, served_by
 
 T = TypeVar("T")
 
@@ -173,7 +173,7 @@ def render(reply: StatusReply) -> RenderableType:
     """The status as tables."""
     slots = sum(worker.slots for worker in reply.workers if worker.state == "active")
     head = (
-        f"cluster {reply.cluster} · evopolicy {reply.version} · up {duration(reply.uptime_s)} ·"
+        f"cluster {reply.cluster} · evopolicy {reply.version} · up {duration(reply.uptime_s)} on {served_by(reply)} ·"
         f" {counted(slots, 'slot')} · {sum(run.queued for run in reply.runs)} queued,"
         f" {sum(run.running for run in reply.runs)} running,"
         f" {counted(reply.episodes_done, 'episode')} done, {reply.episodes_per_s:.1f}/s over the last minute"

@@ -17,6 +17,7 @@ import contextlib
 import errno
 import hmac
 import os
+import socket
 import time
 from collections.abc import Awaitable, Callable, Coroutine, Iterator
 from importlib import metadata
@@ -384,6 +385,8 @@ class Service:
             disk=self._disk,
             cost_s=self._status_cost_s,
             trouble=self._trouble,
+            host=socket.gethostname(),
+            store_latency_s=self.host.store_latency_s,
         )
 
     def _refuse(self, query: IncomingQuery, error: RefusedError) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import io
 import os
 import shutil
 import signal
@@ -28,6 +29,7 @@ from coordinator_harness import (
 )
 from machines.own_certs import CLUSTER, DAYS, free_port, now, of
 from machines.postgres import Server
+from rich.console import Console
 
 from evopolicy_common.errors import RefusedError, TransportError
 from evopolicy_common.messages import gateway
@@ -35,12 +37,19 @@ from evopolicy_common.messages.operator import RunCreated
 from evopolicy_common.messages.status import StatusReply, StatusRequest
 from evopolicy_common.wire.credentials import Credentials, Role
 from evopolicy_common.wire.transport import connect
+from evopolicy_coordinator.cli.status import render
 from evopolicy_coordinator.pki import machines
 
 pytestmark = pytest.mark.cluster
 
 SUBMITS = (((0, 1, 1, 5), "# one"), ((2, 3), "# two"), ((7, 7, 7, 7, 8, 9), "# three"))
 ROLES: tuple[Role, ...] = ("worker", "operator", "gateway")
+
+
+def shown(status: StatusReply) -> str:
+    console = Console(width=400, record=True, file=io.StringIO())
+    console.print(render(status))
+    return console.export_text()
 
 
 class Pair:
@@ -251,7 +260,10 @@ def test_a_paused_leader_that_wakes_up_writes_and_answers_nothing(
             first.ready_file.unlink(missing_ok=True)
             second.kill()
             await asyncio.to_thread(first.await_ready)
-            assert (await operator.status()).cluster
+            status = await operator.status()
+            assert status.host == socket.gethostname()
+            assert status.store_latency_s is not None
+            assert " ms) ·" in shown(status)
 
     with pair_of(tmp_path, secret, server.new()) as pair:
         run(lambda: scenario(pair), 180)

@@ -128,9 +128,12 @@ class StatusCollector(Collector):
         yield _gauge("evopolicy_up", "1 while the coordinator answers.", status is not None)
         if status is None:
             return
-        about = {"version": status.version, "cluster": status.cluster}
+        about = {"version": status.version, "cluster": status.cluster, "host": status.host}
         yield InfoMetricFamily("evopolicy_build", "What serves.", about)
         yield _gauge("evopolicy_uptime_seconds", "Since the coordinator started.", status.uptime_s)
+        if status.store_latency_s is not None:
+            text = "How long PostgreSQL took to confirm that this coordinator leads."
+            yield _gauge("evopolicy_store_latency_seconds", text, status.store_latency_s)
         yield CounterMetricFamily(
             "evopolicy_cluster_episodes",
             "Episodes that the cluster has played since its coordinator started.",

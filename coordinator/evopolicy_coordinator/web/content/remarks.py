@@ -8,6 +8,12 @@ from evopolicy_common.messages.status import RunStatus, StatusReply, WorkerStatu
 from evopolicy_common.terminal import duration
 
 
+def served_by(reply: StatusReply) -> str:
+    """The coordinator's machine, and the latency of its database if it has one."""
+    latency = reply.store_latency_s
+    return reply.host if latency is None else f"{reply.host} (database {1000 * latency:.0f} ms)"
+
+
 def remarks(reply: StatusReply) -> Mapping[str, Iterable[str]]:
     """Whole sentences by heading; some have none."""
     workers = reply.workers

@@ -15,7 +15,7 @@ from evopolicy_common.cli.conventions import bytes_text
 from evopolicy_common.messages.status import DiskUse, StatusReply, WorkerStatus
 from evopolicy_common.terminal import duration
 from evopolicy_coordinator.web.content.cluster import Cluster
-from evopolicy_coordinator.web.content.remarks import remarks
+from evopolicy_coordinator.web.content.remarks import remarks, served_by
 from evopolicy_coordinator.web.content.rendering import PAGE_ROWS, Words, ident, paged, part, short
 from evopolicy_coordinator.web.content.run_folders import RunFacts, Runs
 from evopolicy_results.figures.line_chart import Line, chart
@@ -81,6 +81,7 @@ def _cluster_facts(status: StatusReply) -> list[tuple[str, str]]:
         ("episodes done", short(status.episodes_done)),
         ("up", duration(status.uptime_s)),
         ("version", status.version),
+        ("coordinator", served_by(status)),
     ]
 
 
