@@ -52,7 +52,8 @@ def page() -> str:
         if also := [f"`{each.opts[0]}`" for each in options if _row(each) in shared]:
             parts.append(f"Also {', '.join(also)}.\n")
         if of_a_run := [f"`{each.opts[0]}`" for each in _options(command) if _of_a_run(command, each)]:
-            parts.append(f"[Options of a run](options.md): {', '.join(of_a_run)}.\n")
+            some = f": {', '.join(of_a_run)}" if command.name == "suite" else ""
+            parts.append(f"Also [options of a run](options.md){some}.\n")
     return "\n".join(parts)
 
 

@@ -16,7 +16,8 @@ from evopolicy_gateway.suite.suite_file import Override, RunTable
 HEAD = """# Files, field by field
 
 `evopolicy files schemas/NAME.schema.json` prints the JSON Schema of each of these files (draft 2020-12).
-A question mark follows a field that may be absent; its default is given unless it is empty, zero, false, or null.
+Fields without a type are texts. A question mark follows a field that may be absent; its default is given unless it is
+empty, zero, false, or null. *Also* names fields without a description; the schemas have their types.
 
 An editor with TOML schemas checks a suite file whose first line names its schema. Run
 `evopolicy files schemas/suite.toml.schema.json > suite.schema.json`, and begin the file with
@@ -24,6 +25,8 @@ An editor with TOML schemas checks a suite file whose first line names its schem
 """
 OF_A_RUN = {*declared(RunOptions), *declared(JailSettings)}
 """Settings that `options.md` describes."""
+PLAIN = {f"{kind}{null}" for kind in ("string", "integer", "number", "boolean") for null in ("", " or null")}
+"""Types of fields that need no line of their own without a description."""
 
 
 def page() -> Iterator[str]:
@@ -52,13 +55,18 @@ def _struct(struct: type[msgspec.Struct], described: dict[str, Any], *, first: b
     named = [f"`{name}`" for name in fields if struct in (RunTable, JailSettings) and name in OF_A_RUN]
     if named:
         yield f"[Options of a run](options.md) describes {', '.join(named)}.\n"
+    bare = [name for name, one in fields.items() if "description" not in one and _type_text(one) in PLAIN]
     for name, one in fields.items():
-        if f"`{name}`" not in named:
+        if f"`{name}`" not in named and name not in bare:
             default = None if name in needed else one.get("default")
             value = msgspec.json.encode(default).decode()
             text = f": {one['description']}" if "description" in one else ""
             text += f" Default: `{value}`." if default and len(value) < 40 else ""
-            yield _line(f"- `{name}`{'' if name in needed else '?'} ({_type_text(one)}){text}")
+            kind = _type_text(one).removesuffix(" or null")
+            kind = "" if kind == "string" else f" ({kind})"
+            yield _line(f"- `{name}`{'' if name in needed else '?'}{kind}{text}")
+    if bare:
+        yield f"- Also {', '.join(f'`{name}`' + '?' * (name not in needed) for name in bare)}."
     yield ""
 
 
