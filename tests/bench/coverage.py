@@ -147,9 +147,9 @@ CLAIMS: dict[str, Claim] = {
             **{
                 f"{n} runs, {kind}": (_sometimes(n, *how), 0.2)
                 for kind, how in SOLVED.items()
-                for n in (2, 4, 7, 10)
+                for n in SOLVED_RUNS[:-1]
             },
-            **{f"{n} runs, {_HALF}, {_PAIR}": (_sometimes(n, 0.5, 3.0, alone=True), 1.0) for n in (4, 10)},
+            **{f"{n} runs, {_HALF}, {_PAIR}": (_sometimes(n, 0.5, 3.0, alone=True), 1.0) for n in (4, 5, 10)},
             **{f"{n} runs, {_HALF}, {_UNLIKE}": (_sometimes(n, 0.5, 3.0, unlike=True), 0.2) for n in (7, 10)},
         },
         at_most=(None, None, 5.0, 5.0),

@@ -204,7 +204,7 @@ def test_a_killed_leader_costs_time_and_nothing_else(
     print("another coordinator led after", [round(each, 2) for each in took], "s")
 
 
-def test_no_request_is_lost_or_carried_out_twice_while_the_leader_changes_often(
+def test_many_leader_changes_lose_and_repeat_no_request(
     tmp_path: Path, server: Server, calm: tuple[Path, dict[str, Any]]
 ) -> None:
     """For half a minute leaders are killed or stopped as soon as they have answered three requests."""
@@ -236,7 +236,7 @@ def test_no_request_is_lost_or_carried_out_twice_while_the_leader_changes_often(
     print(changes, "changes of the leader,", len(created), "requests")
 
 
-def test_a_paused_leader_that_wakes_up_writes_and_answers_nothing(
+def test_a_paused_leader_that_wakes_up_writes_nothing(
     tmp_path: Path, server: Server, calm: tuple[Path, dict[str, Any]]
 ) -> None:
     secret, expected = calm
@@ -269,7 +269,7 @@ def test_a_paused_leader_that_wakes_up_writes_and_answers_nothing(
         run(lambda: scenario(pair), 180)
 
 
-def test_a_leader_that_loses_the_database_stops_answering_and_continues_with_it(
+def test_a_leader_cut_from_the_database_stops_answering(
     tmp_path: Path, server: Server, calm: tuple[Path, dict[str, Any]]
 ) -> None:
     """All its packets to the server are held by a proxy; its clients still reach it."""

@@ -50,8 +50,11 @@ def test_each_role_gets_its_own_password_and_only_its_own_token(tmp_path: Path) 
 
 def test_second_coordinator_on_one_folder_is_refused_and_told_by_whom(tmp_path: Path) -> None:
     state = StateFolder.open(tmp_path)
-    with pytest.raises(ConfigError, match=f"in use by another coordinator \\(process {os.getpid()}\\)"):
+    with pytest.raises(
+        ConfigError, match=f"in use by another coordinator \\(process {os.getpid()}\\)"
+    ) as refused:
         StateFolder.open(tmp_path)
+    assert "another state has other hidden cases" in str(refused.value)
     state.close()
     StateFolder.open(tmp_path).close()
 
