@@ -183,7 +183,7 @@ class EnvProcess:
         at, steps = self._last_report
         if now - at >= (_PROGRESS_S if progress.steps != steps else ALIVE_S):
             self._last_report = now, progress.steps
-            self._channel.send(messages.Progress(episodes_done=progress.episodes_done, steps=progress.steps))
+            progress.report(self._channel.send)
 
 
 def main() -> None:

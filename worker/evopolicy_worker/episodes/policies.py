@@ -65,6 +65,12 @@ class Progress:
                 send(messages.Begun(place=place, begun=begun.packed()))
             self._given_up = True
 
+    def report(self, send: Callable[[messages.Message], None]) -> None:
+        """Reports episodes and steps; nothing once the job was given up, since its last answer may have been sent."""
+        with self._lock:
+            if not self._given_up:
+                send(messages.Progress(episodes_done=self.episodes_done, steps=self.steps))
+
     def cancel(self) -> None:
         """Ends the running job at the next step, and the policy at once."""
         self.cancelled = True
