@@ -25,7 +25,7 @@ from evopolicy_gateway.processes.clock import AgentClock
 from stages.loopback import serving_json
 
 FAKES = Path(__file__).parents[1] / "fake_clis"
-TIMEOUT_S = 150.0
+TIMEOUT_S = 300.0
 PATH_TOKEN = "0123456789abcdef0123456789abcdef"
 
 
