@@ -152,7 +152,7 @@ def _task(
         _cluster(where)
     except EvopolicyError as error:
         # Inspect ends with this line. An error in a sample has a traceback, and `inspect eval` exits with 0.
-        text = str(error).partition(" (local, try")[0].replace("with state", "with -T state=FOLDER")
+        text = str(error).replace("with state", "with -T state=FOLDER")
         raise PrerequisiteError(Text(f"error: {text}")) from error
     return Task(
         dataset=dataset,

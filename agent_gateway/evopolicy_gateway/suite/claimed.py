@@ -151,6 +151,7 @@ class ClaimedSweep(Sweep):
             self._view.note(run.name, f"taken over from {self._named(claim.previous)}")
         if decision.kind in ("resume", "finish"):
             taken = bool(claim.previous) or (others and not claim.kept)
+            # A folder with the request alone gets its run when it resumes, from the coordinator or anew.
             opened = run.folder.opened_run.exists()
             if taken or (opened and await self._operations.phase_of(run.folder) is None):
                 decision = self._anew(run.name)

@@ -168,7 +168,7 @@ def lock(root: Path) -> int:
         os.close(fd)
         raise ConfigError(
             f"state folder {root} is in use by another coordinator (process {holder or 'unknown'});"
-            " wait for it, stop it, or choose another folder with --state (local, try, random: or none with --fresh);"
+            " wait for it, stop it, or choose another folder with --state;"
             " without --data, another state has other hidden cases, so its scores are not comparable"
         ) from error
     os.ftruncate(fd, 0)
