@@ -26,7 +26,7 @@ import numpy as np
 
 from evopolicy_common.catalogue import entry, policy_folder, suites
 from evopolicy_common.messages.environment import Case
-from evopolicy_results.scoring.paper import heldout_returns
+from evopolicy_results.scoring.scores import heldout_returns
 from evopolicy_worker.environments.interface.base import Environment
 from evopolicy_worker.environments.registry import make
 

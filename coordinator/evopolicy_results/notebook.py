@@ -23,8 +23,7 @@ from evopolicy_results.reading.comparability import MixedRunsError, mixtures
 from evopolicy_results.reading.reader import load_runs
 from evopolicy_results.reading.records import Run, Submit, rows
 from evopolicy_results.report import write_report
-from evopolicy_results.scoring.paper import heldout_returns
-from evopolicy_results.scoring.scores import leaderboard, score_table
+from evopolicy_results.scoring.scores import heldout_returns, leaderboard, score_table
 from evopolicy_results.studies.study import Study, study, study_of
 from evopolicy_results.tables.report_tables import tables_of
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import msgspec
 
-from evopolicy_gateway.cli import schemas
+from evopolicy_gateway.cli import files
 from evopolicy_gateway.declared import declared
 from evopolicy_gateway.jail.settings import JailSettings
 from evopolicy_gateway.run.run_options import RunOptions
@@ -34,12 +34,12 @@ def page() -> Iterator[str]:
     yield HEAD
     done: set[type[msgspec.Struct]] = set()
     for name in ("suite.toml", "agent.toml", "run.json", "summary.json", "suite.json"):
-        kind, described = schemas.KINDS[name], schemas.schema(name)["$defs"]
+        kind, described = files.KINDS[name], files.schema(name)["$defs"]
         yield f"## {name}\n\n{kind.about} Version {kind.version}.\n"
         later = kind.type in done
         if later:
             yield f"[{kind.type.__name__}](#{kind.type.__name__.lower()}) lists its fields.\n"
-        for struct in schemas.structs(kind.type):
+        for struct in files.structs(kind.type):
             if struct not in done:
                 done.add(struct)
                 yield from _struct(struct, described[struct.__name__], first=struct is kind.type)

@@ -19,8 +19,7 @@ from evopolicy_coordinator.core.leasing import expiry, fleet, groups, leases, qu
 from evopolicy_coordinator.core.runs import finalisation, finished, result_polls, submits, templates
 from evopolicy_coordinator.core.structures.ledger import Ledger
 from evopolicy_coordinator.core.tables.model import Profile
-from evopolicy_coordinator.core.tables.related import CaseSets
-from evopolicy_coordinator.core.tables.state import State
+from evopolicy_coordinator.core.tables.state import CaseSets, State
 from evopolicy_coordinator.core.tables.step import Step
 from evopolicy_coordinator.core.workers import membership, results, scheduler
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import fcntl
+import itertools
 import os
 import secrets
 import shutil
@@ -40,7 +41,6 @@ from evopolicy_worker.capabilities import Capabilities, describe_all, log_missin
 from evopolicy_worker.doctor import best_tier, examine
 from evopolicy_worker.environments.interface.calls import USUAL, Limits
 from evopolicy_worker.environments.interface.fingerprint import fingerprint
-from evopolicy_worker.slots import cores
 from evopolicy_worker.slots.slot import Slot
 from evopolicy_worker.slots.tiers import SANDBOXED, available_tiers, try_out, why_not
 from evopolicy_worker.supervisor import MAX_PREPARED, Options, Supervisor
@@ -255,7 +255,7 @@ async def _run(
     """`joining`: the credentials; None where they do not exist before `ready_file` is written. `packages`:
     those that policies may import besides numpy."""
     notify_of_many_slots(n_slots or 0)
-    taken = cores.take(n_slots)
+    taken = _take_cores(n_slots)
     importable = policy_versions(packages)
     # Environments that do not ship are defined in the processes that play them.
     foreign = tuple(catalogue.entry(env_id) for env_id in env_ids if not catalogue.is_shipped(env_id))
@@ -350,6 +350,35 @@ def main() -> None:
     if sys.platform != "linux":
         fail("evopolicy-worker runs on Linux (or WSL2): its sandbox is made of Linux namespaces")
     run_app(app)
+
+
+_CORE_NAME = "\0evopolicy-core-{}"
+_core_names: list[socket.socket] = []
+"""Of this process's cores, until it ends."""
+
+
+def _take_cores(n: int | None) -> list[int]:
+    """A core for each of `n` slots: those that no worker of this machine has taken, then all in turn. None:
+    as many slots as this process has cores.
+
+    A slot's environment and policy processes share one core: a pipe round trip costs 7 µs there and over 100 µs across
+    cores. The workers of one machine coordinate by names of Unix sockets: the kernel frees a name with its process, and
+    no file of another user can be in the way.
+    """
+    allowed = sorted(os.sched_getaffinity(0))
+    n = n or len(allowed)
+    taken: list[int] = []
+    for core in allowed:
+        if len(taken) < n:
+            name = socket.socket(socket.AF_UNIX)
+            try:
+                name.bind(_CORE_NAME.format(core))
+            except OSError:
+                name.close()
+                continue
+            _core_names.append(name)
+            taken.append(core)
+    return [*taken, *itertools.islice(itertools.cycle(allowed), n - len(taken))]
 
 
 if __name__ == "__main__":

@@ -21,6 +21,7 @@ import csv
 import io
 import math
 from collections.abc import Iterable, Mapping, Sequence
+from importlib.resources import files
 from statistics import fmean
 
 import msgspec
@@ -428,3 +429,19 @@ def normalised(table: ScoreTable) -> Normalised:
             mean = fmean(values) if values and len(values) == len(own) else None
             groups.append(GroupMean(entry=entry, demand=demand, value=mean, n_environments=len(values)))
     return Normalised(cells=cells, groups=tuple(groups))
+
+
+def paper_text(name: str) -> str:
+    """The CSV text of one of the paper's own tables, by its file's name without the ending; `data/SOURCE.md` names the
+    source of each."""
+    return files("evopolicy_results").joinpath("data", f"{name}.csv").read_text(encoding="utf-8")
+
+
+def heldout_returns() -> ScoreTable:
+    """The paper's table of held-out returns: four agents and the random reference on Core16, one run per cell."""
+    return read_score_csv(paper_text("table1_heldout_returns"), source="table1_heldout_returns.csv")
+
+
+def paper_rows(name: str) -> list[dict[str, str]]:
+    """One table of the paper as printed, one dict per row."""
+    return list(csv.DictReader(io.StringIO(paper_text(name))))

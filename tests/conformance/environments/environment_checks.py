@@ -15,7 +15,7 @@ from typing import Any
 
 from evopolicy_common.catalogue import suites
 from evopolicy_worker.environments import Environment, make, process_environment
-from evopolicy_worker.environments.checks.episodes import add, rollout
+from evopolicy_worker.environments.checks.conformance import add, rollout
 
 IDS = [*suites()["core16"].environments, *suites()["toy"].environments]
 """Those with a text and numbers of their own; `test_families.py` looks at the others."""

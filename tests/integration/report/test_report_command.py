@@ -23,7 +23,7 @@ from evopolicy_results.cli.report import app
 from evopolicy_results.notebook import figures_of, rows, write_report
 from evopolicy_results.reading.parallel import Processes
 from evopolicy_results.report import write_report as write
-from evopolicy_results.scoring import paper
+from evopolicy_results.scoring.scores import paper_rows, paper_text
 from evopolicy_results.studies.study import study
 
 ENVIRONMENTS = ("gym/acrobot", "gym/racing", "toy/line")
@@ -249,10 +249,10 @@ def test_report_is_the_same_whether_one_or_two_processes_make_it(
 
 def test_papers_table_as_input_gives_its_aggregate_table(tmp_path: Path) -> None:
     source = tmp_path / "table.csv"
-    source.write_text(paper.text("table1_heldout_returns"))
+    source.write_text(paper_text("table1_heldout_returns"))
     reported(source, tmp_path / "report")
     written = table(tmp_path / "report", "leaderboard")
-    for row, printed in zip(written, paper.rows("table2_aggregate"), strict=True):
+    for row, printed in zip(written, paper_rows("table2_aggregate"), strict=True):
         assert row["entry"] == printed["entry"]
         assert f"{float(row['score']):.3f}" == printed["core16"]
         assert (row["wins"], row["top2"]) == (printed["wins"], printed["top2"])

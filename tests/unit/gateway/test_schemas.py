@@ -18,7 +18,7 @@ from invented.run_dirs import write_run
 from jsonschema import Draft202012Validator
 
 from evopolicy_common.records.suite_folder import Entry, Index
-from evopolicy_gateway.cli import schemas
+from evopolicy_gateway.cli import files
 from evopolicy_gateway.suite.suite_index import save
 
 ROOT = Path(__file__).parents[3]
@@ -28,7 +28,7 @@ AGENTS = sorted((ROOT / "examples/agents").glob("*.toml"))
 
 def problems(name: str, value: Any) -> list[str]:
     """The validator's complaints about a file's content."""
-    return [error.message for error in Draft202012Validator(schemas.schema(name)).iter_errors(value)]
+    return [error.message for error in Draft202012Validator(files.schema(name)).iter_errors(value)]
 
 
 def written(folder: Path) -> dict[str, Any]:
@@ -48,9 +48,9 @@ def written(folder: Path) -> dict[str, Any]:
     }
 
 
-@pytest.mark.parametrize("name", schemas.KINDS)
+@pytest.mark.parametrize("name", files.KINDS)
 def test_a_schema_is_one(name: str) -> None:
-    made = schemas.schema(name)
+    made = files.schema(name)
     Draft202012Validator.check_schema(made)
     assert made["$id"].startswith(f"urn:evopolicy:schema:{name}:")
 
@@ -99,9 +99,9 @@ def tables(value: dict[str, Any]) -> Iterator[tuple[Any, ...]]:
 
 
 def test_fields_have_the_words_of_their_docstrings() -> None:
-    override = schemas.schema("suite.toml")["$defs"]["Override"]["properties"]
+    override = files.schema("suite.toml")["$defs"]["Override"]["properties"]
     assert override["agents"]["description"] == "Names or globs."
-    assert schemas.schema("run.json")["$defs"]["RunRecord"]["properties"]["env"]["description"].startswith(
+    assert files.schema("run.json")["$defs"]["RunRecord"]["properties"]["env"]["description"].startswith(
         "Suite id"
     )
 
@@ -111,7 +111,7 @@ def test_the_command_prints_a_schema_and_refuses_other_names() -> None:
     done = subprocess.run(
         [evopolicy, "files", "schemas/run.json.schema.json"], capture_output=True, text=True, check=True
     )
-    assert json.loads(done.stdout) == json.loads(msgspec.json.encode(schemas.schema("run.json")))
+    assert json.loads(done.stdout) == json.loads(msgspec.json.encode(files.schema("run.json")))
     wrong = subprocess.run([evopolicy, "files", "schemas/runs"], capture_output=True, text=True, check=False)
     assert wrong.returncode == 2
     assert "no file 'schemas/runs'" in wrong.stderr

@@ -9,14 +9,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from evopolicy_common.errors import ConfigError
-from evopolicy_results.scoring import paper
 from evopolicy_results.scoring.scores import (
     Cell,
     RunReturns,
     ScoreTable,
     competition_ranks,
+    heldout_returns,
     leaderboard,
     normalised,
+    paper_rows,
     rank_score,
     read_score_csv,
     scale_between,
@@ -36,8 +37,8 @@ def table(scores: dict[str, dict[str, tuple[float | None, ...]]], reference: str
 
 
 def test_paper_table_of_returns_gives_its_aggregate_table_to_the_digit() -> None:
-    board = leaderboard(paper.heldout_returns())
-    printed = paper.rows("table2_aggregate")
+    board = leaderboard(heldout_returns())
+    printed = paper_rows("table2_aggregate")
     assert [row.entry for row in board.standings] == [row["entry"] for row in printed]
     for row, expected in zip(board.standings, printed, strict=True):
         assert [f"{row.families[family]:.3f}" for family in FAMILIES] == [
@@ -49,10 +50,10 @@ def test_paper_table_of_returns_gives_its_aggregate_table_to_the_digit() -> None
 
 
 def test_paper_table_of_returns_gives_its_normalised_table_to_two_decimals() -> None:
-    table = paper.heldout_returns()
+    table = heldout_returns()
     result = normalised(table)
     groups = {(group.entry, group.demand): group for group in result.groups}
-    for row in paper.rows("normalised_performance"):
+    for row in paper_rows("normalised_performance"):
         for entry in table.agents:
             of_env, of_group = (entry, row["env"]), (entry, row["demand"])
             value = groups[of_group].value if row["env"] == "mean" else result.cells[of_env]

@@ -3,8 +3,12 @@ the rules change it."""
 
 from __future__ import annotations
 
+import json
+from collections import deque
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 
+from evopolicy_common.messages.environment import Case
 from evopolicy_common.messages.gateway import RunState
 from evopolicy_coordinator.core.contract.records import (
     BegunRow,
@@ -14,13 +18,14 @@ from evopolicy_coordinator.core.contract.records import (
     PermitRow,
 )
 from evopolicy_coordinator.core.contract.settings import CoreSettings
+from evopolicy_coordinator.core.structures import take
 from evopolicy_coordinator.core.structures.polls import Polls
-from evopolicy_coordinator.core.structures.rate import Rate
 from evopolicy_coordinator.core.structures.timers import Timers
 from evopolicy_coordinator.core.tables.model import (
     EVERYWHERE,
     RANKS,
     Ask,
+    CaseKey,
     CaseSet,
     Evaluation,
     Flow,
@@ -36,9 +41,9 @@ from evopolicy_coordinator.core.tables.model import (
     Run,
     Worker,
 )
-from evopolicy_coordinator.core.tables.related import CaseSets
 
 ATTEMPTS_PER_INCARNATION = 1_000_000
+_RATE_S = 60
 
 
 @dataclass(slots=True)
@@ -136,3 +141,74 @@ class State:
         """By worker: as stored."""
         self.grantable = False
         """Whether a requested permit may have become possible in this step."""
+
+
+class Rate:
+    """Episodes done, in total and over the last minute: one count per second."""
+
+    def __init__(self) -> None:
+        self.total = 0
+        self._seconds: deque[list[int]] = deque(maxlen=_RATE_S)
+
+    def count(self, n: int, now: float) -> None:
+        """Add `n` episodes, done at `now` (Unix seconds)."""
+        self.total += n
+        second = int(now)
+        if self._seconds and self._seconds[-1][0] == second:
+            self._seconds[-1][1] += n
+        else:
+            self._seconds.append([second, n])
+
+    def per_s(self, now: float) -> float:
+        """Episodes per second over the last minute."""
+        return sum(n for second, n in self._seconds if second > now - _RATE_S) / _RATE_S
+
+
+class CaseSets:
+    """Finds related case sets: runs and evaluations that share a hidden case are related; with `strict` all are.
+
+    A case set is known while a run, an evaluation, a permit or a lease belongs to it.
+    """
+
+    def __init__(self, *, strict: bool) -> None:
+        self._strict = strict
+        self._known: dict[frozenset[CaseKey], CaseSet] = {}
+        self._of_case: dict[CaseKey, dict[CaseSet, None]] = {}
+
+    def join(self, env: str, cases: Iterable[Case]) -> CaseSet:
+        """Returns the case set with these hidden cases and adds one to its users."""
+        keys: frozenset[CaseKey] = frozenset()
+        if not self._strict:
+            keys = frozenset(
+                (env, case.seed, json.dumps(case.options or None, sort_keys=True)) for case in cases
+            )
+        case_set = self._known.get(keys)
+        if case_set is None:
+            case_set = self._known[keys] = CaseSet(keys)
+            case_set.relatives[case_set] = None
+            for key in keys:
+                there = self._of_case.setdefault(key, {})
+                for other in there:
+                    other.relatives[case_set] = None
+                    case_set.relatives[other] = None
+                there[case_set] = None
+        case_set.users += 1
+        return case_set
+
+    def known(self) -> Iterable[CaseSet]:
+        """Returns all case sets in use."""
+        return self._known.values()
+
+    def leave(self, case_set: CaseSet | None) -> None:
+        """Remove one user of a case set; the last one removes the case set."""
+        if case_set is None:
+            return
+        case_set.users -= 1
+        if case_set.users:
+            return
+        del self._known[case_set.cases]
+        for other in case_set.relatives:
+            if other is not case_set:
+                del other.relatives[case_set]
+        for key in case_set.cases:
+            take(self._of_case, key, case_set)

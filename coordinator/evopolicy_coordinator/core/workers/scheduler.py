@@ -10,6 +10,8 @@ Rules that this module owns:
   longest waiting.
 - At the end of each step `dispatch` leases the work that the step made available; apart from it only a poll and the
   end of a bench time call the scheduler.
+- A suspect, a job that may crash workers, runs alone, on an idle worker or on one that is emptied for it; that worker
+  gets no other job in the meantime.
 """
 
 from __future__ import annotations
@@ -20,11 +22,11 @@ from itertools import islice
 from evopolicy_common.messages import worker as wire
 from evopolicy_coordinator.core.agents import permits, precedence
 from evopolicy_coordinator.core.contract.events import Requested
+from evopolicy_coordinator.core.isolation import conflicts
 from evopolicy_coordinator.core.leasing import fleet, leases, queue
-from evopolicy_coordinator.core.tables.model import Lane, LeasePoll, Worker
+from evopolicy_coordinator.core.tables.model import JobState, Lane, LeasePoll, Worker
 from evopolicy_coordinator.core.tables.state import State
 from evopolicy_coordinator.core.tables.step import Step
-from evopolicy_coordinator.core.workers import suspects
 
 PREFETCH_BELOW_S = 1.0
 """Longer episodes are leased to free slots only: the time to fetch them is negligible beside their play time."""
@@ -34,6 +36,9 @@ TRIES_MAX = 4
 
 SKIPPED_MAX = 64
 """Most parked workers on kernels barred to a lane that are skipped in one step."""
+
+SUSPECTS_MAX = 16
+"""Most suspects checked in one step."""
 
 LEASES_MAX = 256
 """Most leases in one reply: it must fit into a message."""
@@ -90,7 +95,7 @@ def _fill(state: State, worker: Worker, step: Step) -> list[wire.Lease]:
         return []
     if step.now > poll.until + state.settings.late_s:
         return []
-    if state.suspects and (suspect := suspects.next_suspect(state, worker, step)) is not None:
+    if state.suspects and (suspect := _next_suspect(state, worker, step)) is not None:
         return [suspect]
     if worker.reserved is not None:
         return []
@@ -155,7 +160,7 @@ def dispatch(state: State, step: Step) -> None:
 
 def _place_suspects(state: State, step: Step) -> None:
     """Offer waiting suspects to idle workers."""
-    for job in list(islice(state.suspects, suspects.SUSPECTS_MAX)):
+    for job in list(islice(state.suspects, SUSPECTS_MAX)):
         lane = job.group.flow.lane
         if lane is not None and job.queued:
             for profile in lane.profiles:
@@ -228,3 +233,41 @@ def _parked(state: State, lane: Lane) -> Worker | None:
             if queue.may_serve(state, lane, workers[name]):
                 return workers[name]
     return None
+
+
+def _next_suspect(state: State, worker: Worker, step: Step) -> wire.Lease | None:
+    """Lease a suspect to an idle worker; a busy worker may be reserved for one instead (returns None)."""
+    idle = not worker.leases
+    if worker.reserved is not None:
+        job = worker.reserved
+        if not job.queued or _barred(state, job, worker):
+            worker.reserved = job.reserved = None
+        elif not idle:
+            return None
+        else:
+            return _alone(state, job, worker, step)
+    for job in list(islice(state.suspects, SUSPECTS_MAX)):
+        lane = job.group.flow.lane
+        if lane is None or worker.profile not in lane.profiles:
+            continue
+        if job.reserved is not None and not idle:
+            continue
+        if job.avoid == worker.name and step.now < job.avoid_until and lane.workers() > 1:
+            continue
+        if _barred(state, job, worker):
+            continue
+        if idle:
+            return _alone(state, job, worker, step)
+        job.reserved, worker.reserved = worker.name, job
+        return None
+    return None
+
+
+def _barred(state: State, job: JobState, worker: Worker) -> bool:
+    return conflicts.conflict(state, job.priority, job.group.flow.case_set, worker)
+
+
+def _alone(state: State, job: JobState, worker: Worker, step: Step) -> wire.Lease:
+    fleet.unreserve(state, job)
+    queue.withdraw(state, job)
+    return leases.grant(state, job, worker, step)

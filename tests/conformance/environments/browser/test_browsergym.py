@@ -18,7 +18,7 @@ from evopolicy_worker.environments import Environment
 from evopolicy_worker.environments.browser.browsergym_calls import DEFAULTS, SIGNATURES, calls
 from evopolicy_worker.environments.browser.browsergym_env import BrowserGymEnv
 from evopolicy_worker.environments.browser.page import shared
-from evopolicy_worker.environments.checks import conformance, episodes
+from evopolicy_worker.environments.checks import conformance
 
 pytestmark = pytest.mark.families
 
@@ -135,8 +135,8 @@ def test_a_reused_page_looks_like_a_fresh_one(page: str, seed: int, before: str,
 
     def seen() -> str:
         state = hashlib.sha256()
-        episodes.add(state, environment.reset(seed=seed)[0])
-        episodes.add(state, environment.step(then)[0])
+        conformance.add(state, environment.reset(seed=seed)[0])
+        conformance.add(state, environment.step(then)[0])
         return state.hexdigest()
 
     shared().lose()

@@ -20,7 +20,7 @@ from evopolicy_worker.environments.browser import chromium
 from evopolicy_worker.environments.browser import page as page_module
 from evopolicy_worker.environments.browser.miniwob_env import ACTIONS, KEYS, MiniWoBEnv
 from evopolicy_worker.environments.browser.page import shared
-from evopolicy_worker.environments.checks import conformance, episodes
+from evopolicy_worker.environments.checks import conformance
 from evopolicy_worker.environments.interface.base import Step
 from evopolicy_worker.environments.interface.settings import BROWSER
 
@@ -208,7 +208,7 @@ def test_an_environment_keeps_what_the_interface_promises(env_id: str) -> None:
     [("miniwob/text-editor-v1", 20_011_117, 40), ("miniwob/choose-date-v1", 1, 15)],
 )
 def test_a_drag_and_a_lost_focus_are_waited_for(env_id: str, seed: int, steps: int, warm: Warm) -> None:
-    assert len({episodes.digest(warm(env_id), seed, steps) for _ in range(5)}) == 1
+    assert len({conformance.digest(warm(env_id), seed, steps) for _ in range(5)}) == 1
 
 
 # Pages that the end of an episode leaves in the middle of an animation.

@@ -16,7 +16,7 @@ from gateway_double import LINE, opened
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.messages.episode import ResourceLimits
 from evopolicy_common.records.blobs import digest_of
-from evopolicy_gateway.http.info import info_document
+from evopolicy_gateway.http.service import info_document
 from evopolicy_gateway.http.task import task_markdown
 from evopolicy_gateway.run_folder.layout import RunFolder, run_folder
 from evopolicy_gateway.submits.tickets import TicketMachine

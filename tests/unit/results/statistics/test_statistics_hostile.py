@@ -21,8 +21,7 @@ from invented.study import write_suite
 
 from evopolicy_common.statistics.intervals import TOO_FEW_CASES
 from evopolicy_results.notebook import figures_of, tables_of
-from evopolicy_results.scoring.paper import heldout_returns
-from evopolicy_results.scoring.scores import Cell, RunReturns, Scale
+from evopolicy_results.scoring.scores import Cell, RunReturns, Scale, heldout_returns
 from evopolicy_results.statistics.aggregates import NO_SCALE, Aggregate, aggregates
 from evopolicy_results.statistics.intervals import holm
 from evopolicy_results.statistics.pairs import (

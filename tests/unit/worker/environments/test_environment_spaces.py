@@ -10,8 +10,7 @@ import pytest
 from gymnasium import spaces
 
 from evopolicy_common.messages.environment import SpaceSchema
-from evopolicy_worker.environments.interface.observations import compile_observation
-from evopolicy_worker.environments.interface.spaces import bounds, obs_storage, to_schema
+from evopolicy_worker.environments.interface.spaces import bounds, compile_observation, obs_storage, to_schema
 
 FLOATS: dict[str, Any] = {"type": "Box", "dtype": "float32"}
 IMAGE = {

@@ -20,8 +20,7 @@ from evopolicy_common.records.episodes.trajectory import Recorder, decode
 from evopolicy_gateway.agents import uniform
 from evopolicy_gateway.workspace.staging import constant_action
 from evopolicy_worker.environments import Environment, compile_actions, define, describe, make, registry
-from evopolicy_worker.environments.interface.gymnasium_adapter import GymnasiumFamily
-from evopolicy_worker.environments.interface.opaque import Opaque
+from evopolicy_worker.environments.interface.gymnasium_adapter import GymnasiumFamily, Opaque
 from evopolicy_worker.environments.interface.spaces import compile_checker
 from evopolicy_worker.environments.interface.trial import solved
 from evopolicy_worker.episodes.frames import compile_writer

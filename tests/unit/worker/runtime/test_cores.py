@@ -8,9 +8,9 @@ import sys
 
 TAKES = """
 import sys
-from evopolicy_worker.slots import cores
-cores._NAME = "\\0{name}-{{}}"
-print(cores.take({n}), flush=True)
+from evopolicy_worker import cli
+cli._CORE_NAME = "\\0{name}-{{}}"
+print(cli._take_cores({n}), flush=True)
 sys.stdin.read()
 """
 

@@ -9,6 +9,7 @@ environment.
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import os
 import pickle
 import resource
@@ -34,7 +35,6 @@ from evopolicy_common.processes.scratch import remove_tree
 from evopolicy_common.records.episodes.npz import MAX_BYTES, read_arrays
 from evopolicy_common.records.episodes.rendered import Renderer, decode
 from evopolicy_worker.environments import registry
-from evopolicy_worker.environments.checks.episodes import digest, digest_of, rollout
 from evopolicy_worker.environments.interface import spaces
 from evopolicy_worker.environments.interface.base import Environment, Step
 from evopolicy_worker.environments.interface.trial import SEEDED
@@ -310,6 +310,55 @@ def main() -> None:
     for played in play_all(sys.argv[2:], int(sys.argv[1])):
         sys.stdout.buffer.write(msgspec.json.encode(played) + b"\n")
         sys.stdout.buffer.flush()
+
+
+def rollout(
+    environment: Environment, seed: int, steps: int, *, drawn: bool = False
+) -> Iterator[tuple[Any, Step]]:
+    """Plays at most `steps` steps with random actions drawn from `seed` (`Environment.draw`). Yields each action with
+    its step; the first item is None with the first observation. `drawn`: draws each state before the action."""
+    rng = np.random.default_rng(seed)
+    step = Step(environment.reset(Case(seed=seed)), 0.0, False, False, {})
+    yield None, step
+    for _ in range(steps):
+        if drawn:
+            environment.render()
+        action = environment.draw(rng, step.obs)
+        step = environment.step(action)
+        yield action, step
+        if step.terminated or step.truncated:
+            return
+
+
+def digest(environment: Environment, seed: int, steps: int, *, drawn: bool = False) -> str:
+    """Plays an episode, and returns the digest of all its observations, rewards, end flags, and infos."""
+    return digest_of(rollout(environment, seed, steps, drawn=drawn))
+
+
+def digest_of(episode: Iterator[tuple[Any, Step]]) -> str:
+    """The digest of an episode that `rollout` plays."""
+    state = hashlib.sha256()
+    for n, (_, step) in enumerate(episode):
+        add(state, tuple(step) if n else step.obs)
+    return state.hexdigest()[:16]
+
+
+def add(state: Any, value: Any) -> None:
+    """Adds a value to a hash, so that any difference shows, including types and signs of zero."""
+    if isinstance(value, np.ndarray):
+        state.update(f"{value.dtype.str}{value.shape}".encode())
+        state.update(value.tobytes())
+    elif isinstance(value, dict):
+        for key, item in value.items():
+            state.update(str(key).encode())
+            add(state, item)
+    elif isinstance(value, list | tuple):
+        state.update(f"{len(value)}".encode())
+        for item in value:
+            add(state, item)
+    else:
+        exact = value.hex() if isinstance(value, float) else value
+        state.update(f"{type(value).__name__}:{exact!r}".encode())
 
 
 if __name__ == "__main__":

@@ -31,7 +31,7 @@ REVISION = 1
 """Incremented when a change in the shared modules changes episodes. Scores of different revisions are not compared."""
 _ROOT = Path(__file__).parents[2]
 """The package `evopolicy_worker`."""
-_INTERFACE = "actions base gymnasium_adapter info observations rewards settings spaces"
+_INTERFACE = "actions base gymnasium_adapter info rewards settings spaces"
 _SHARED = (
     *(f"environments/interface/{name}.py" for name in _INTERFACE.split()),
     *("episodes/*.py", "slot_protocol/begun.py", "sandbox/inside/*.py"),

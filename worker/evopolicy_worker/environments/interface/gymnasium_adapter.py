@@ -13,9 +13,9 @@ import difflib
 import importlib
 import io
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from importlib.util import find_spec
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -31,10 +31,76 @@ from evopolicy_worker.environments.interface.calls import current as call
 from evopolicy_worker.environments.interface.calls import described
 from evopolicy_worker.environments.interface.fingerprint import adapter, versions
 from evopolicy_worker.environments.interface.info import OURS, THEIRS, plain_info
-from evopolicy_worker.environments.interface.observations import compile_observation
-from evopolicy_worker.environments.interface.opaque import Opaque, converter, declared, visible
 from evopolicy_worker.environments.tasks import task_text
 from evopolicy_worker.environments.tasks.template import About
+
+if TYPE_CHECKING:
+    import gymnasium
+
+Convert = Callable[[Any], Any]
+
+
+class Opaque(NamedTuple):
+    """How a family encodes the values of one space of a kind that the protocol has no form for.
+
+    The family names a space of a known kind, and how a value becomes one of that space and back
+    (`GymnasiumFamily.opaque`). Policies, feedback and recordings have the encoded values only. The space may be a part
+    of a Dict or Tuple.
+    """
+
+    space: gymnasium.Space[Any]
+    """Of a known kind; what policies see."""
+    encode: Convert
+    """From a value of the opaque space to one of `space`."""
+    decode: Convert
+    """Back, for actions; gets repaired values."""
+
+
+Hook = Callable[["gymnasium.Space[Any]"], Opaque | None]
+
+
+def declared(space: gymnasium.Space[Any]) -> Opaque | None:
+    """The encoding that a space declares itself by `encoded_space`, `encode` and `decode`; None without these."""
+    parts: list[Any] = [getattr(space, name, None) for name in ("encoded_space", "encode", "decode")]
+    return None if any(part is None for part in parts) else Opaque(*parts)
+
+
+def visible(space: gymnasium.Space[Any], hook: Hook) -> gymnasium.Space[Any]:
+    """The space with known kinds in place of opaque ones."""
+    from gymnasium import spaces
+
+    opaque = hook(space)
+    if opaque is not None:
+        return opaque.space
+    if isinstance(space, spaces.Dict):
+        # As pairs: of a dict, Gymnasium sorts the keys.
+        return spaces.Dict([(key, visible(part, hook)) for key, part in space.spaces.items()])
+    if isinstance(space, spaces.Tuple):
+        return spaces.Tuple([visible(part, hook) for part in space.spaces])
+    return space
+
+
+def converter(space: gymnasium.Space[Any], hook: Hook, *, back: bool) -> Convert | None:
+    """Encodes values of a space, or decodes them (`back`); None where nothing in it is opaque."""
+    from gymnasium import spaces
+
+    opaque = hook(space)
+    if opaque is not None:
+        return opaque.decode if back else opaque.encode
+    if isinstance(space, spaces.Dict):
+        named = {
+            key: made for key, part in space.spaces.items() if (made := converter(part, hook, back=back))
+        }
+        if named:
+            return lambda value: {**value, **{key: made(value[key]) for key, made in named.items()}}
+    if isinstance(space, spaces.Tuple):
+        parts = [converter(part, hook, back=back) for part in space.spaces]
+        if any(parts):
+            return lambda value: tuple(
+                each if made is None else made(each) for made, each in zip(parts, value, strict=True)
+            )
+    return None
+
 
 if TYPE_CHECKING:
     import gymnasium
@@ -201,7 +267,7 @@ class GymnasiumEnvironment(Environment):
         self._build()
         self.parameters = tuple(sorted(family.parameters(self.bare)))
         obs_schema, action_schema = self._schema("observation_space"), self._schema("action_space")
-        self._observe = compile_observation(obs_schema)
+        self._observe = spaces.compile_observation(obs_schema)
         self._encode = converter(self.bare.observation_space, family.encoding, back=False)
         self._decode = converter(self.bare.action_space, family.encoding, back=True)
         self._promises = None if is_shipped(entry.id) else trial.Promises(self._schema, entry.success)
