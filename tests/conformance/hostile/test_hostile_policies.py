@@ -292,8 +292,8 @@ def test_names_that_a_policy_looked_for_tell_a_later_one_nothing(slots: Slots, t
         play(second_slot(slots, tier), role="listen", n=len(bits), walk=walk)
     )
     agreeing = sum(one == bool(other) for one, other in zip(heard, bits, strict=True))
-    # Guessing gets half of them, give or take ten.
-    assert (agreeing > 300) == (tier == "none"), agreeing
+    # Guessing gets 200 of them, give or take ten; a busy machine forgets some of what was told.
+    assert (agreeing > 250) == (tier == "none"), agreeing
     assert (machines_folders != []) == (tier == "none"), machines_folders
 
 
