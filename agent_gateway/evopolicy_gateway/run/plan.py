@@ -195,7 +195,9 @@ class Plan(msgspec.Struct, frozen=True, kw_only=True):
             raise ConfigError(f"{folder.root} cannot start from itself; choose another --exp-id")
         if not folder.root.exists():
             return
-        if not (folder.run_json.exists() or folder.state.exists() or not any(folder.root.iterdir())):
+        # A command that was killed while it emptied the folder leaves any part of it, and `asked`.
+        marks = (folder.run_json, folder.state, folder.asked)
+        if any(folder.root.iterdir()) and not any(mark.exists() for mark in marks):
             raise ConfigError(f"{folder.root} is not a run's folder; choose another --runs or --exp-id")
         self.check_owner()
         if self.resume and (intended := self.intended()) is not None:

@@ -142,6 +142,9 @@ def test_a_runs_folder_is_claimed_once_and_replaced_only_on_demand(tmp_path: Pat
     with pytest.raises(ConfigError, match="not a run's folder"):
         plan_in(tmp_path, overwrite=True).claim()
     assert (first.folder.root / "thesis.tex").exists()
+    first.folder.asked.touch()  # as a command leaves it that was killed while it removed a run
+    plan_in(tmp_path, overwrite=True).claim()
+    assert list(first.folder.root.iterdir()) == []
 
 
 def test_limits_are_the_usual_ones_but_for_those_named() -> None:
