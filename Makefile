@@ -95,7 +95,8 @@ test test-root: HOST = --tests
 test test-root: TEMPORARY = TMPDIR="$$short"
 test-system test-families test-long: HOST = --all-tests
 test-cluster: HOST = --cluster
-test-cluster: PROCESSES = 0
+# Each of them has a server of its own.
+test-cluster: PROCESSES = $$(( $$(nproc) + 1 ))
 # The tests start hundreds of processes: none of them shall compile our modules anew, whatever the shell asks of Python.
 test test-root test-system test-families test-long test-cluster: export PYTHONDONTWRITEBYTECODE :=
 test test-root test-system test-families test-long test-cluster: install

@@ -52,9 +52,10 @@ _WALLS = (
 _ONE_BY_ONE = (
     *(f"tests/families/test_{name}.py::" for name in ("proof_of_life", "parity", "cited_policies")),
     "tests/unit/worker/runtime/test_foreign_slots.py::",
+    "tests/integration/coordinator/test_standby.py::",
 )
 """Their tests share nothing and take minutes together: each is played where there is room."""
-_SHARED = ("cheated", "forked", "server")
+_SHARED = ("cheated", "forked")
 """Fixtures that files share: a cluster to be cheated, and a process with all commands imported."""
 
 

@@ -43,6 +43,7 @@ from evopolicy_coordinator.pki import machines
 pytestmark = pytest.mark.cluster
 
 SUBMITS = (((0, 1, 1, 5), "# one"), ((2, 3), "# two"), ((7, 7, 7, 7, 8, 9), "# three"))
+CHANGES = int(os.environ.get("EVOPOLICY_LEADER_CHANGES", "6"))
 ROLES: tuple[Role, ...] = ("worker", "operator", "gateway")
 
 
@@ -204,18 +205,19 @@ def test_a_killed_leader_costs_time_and_nothing_else(
     print("another coordinator led after", [round(each, 2) for each in took], "s")
 
 
+@pytest.mark.timeout(120 + 10 * CHANGES)
 def test_many_leader_changes_lose_and_repeat_no_request(
     tmp_path: Path, server: Server, calm: tuple[Path, dict[str, Any]]
 ) -> None:
-    """For half a minute leaders are killed or stopped as soon as they have answered three requests."""
+    """Leaders are killed or stopped in turn, as soon as they have answered three requests."""
     created: dict[str, str] = {}
     changes = 0
 
     async def scenario(pair: Pair) -> None:
         nonlocal changes
         async with clients(pair) as (operator, _):
-            until, leader = time.monotonic() + 30.0, 0
-            while time.monotonic() < until:
+            leader = 0
+            while changes < CHANGES:
                 for _ in range(3):
                     key = f"run-{len(created)}"
                     created[key] = (await patiently(lambda: operator.create(key))).run  # noqa: B023
@@ -229,7 +231,7 @@ def test_many_leader_changes_lose_and_repeat_no_request(
                 leader, changes = 1 - leader, changes + 1
 
     with pair_of(tmp_path, calm[0], server.new()) as pair:
-        run(lambda: scenario(pair), 180)
+        run(lambda: scenario(pair), 60 + 10 * CHANGES)
         stored = server.query(pair.address, "SELECT key, run FROM runs")
         assert dict(stored) == created
         assert len(stored) == len(set(created.values())) == 4 * changes
@@ -294,7 +296,8 @@ def test_a_leader_cut_from_the_database_stops_answering(
                     while True:
                         await operator.ask.once("status", StatusRequest(token=operator.token), StatusReply)
                         await asyncio.sleep(0.2)
-                assert "has not confirmed the lead" in pair.members[0].log.read_text()
+                while "has not confirmed the lead" not in pair.members[0].log.read_text():
+                    await asyncio.sleep(0.05)
                 proxy.held.clear()
                 assert await played(operator, gateway_of) == expected
 

@@ -104,9 +104,10 @@ class Server:
         self.process.wait(_TIMEOUT_S)
 
     def close(self) -> None:
-        """Stops it and removes its files."""
+        """Ends it and removes its files."""
         if self.process.poll() is None:
-            self.stop()
+            self.process.send_signal(signal.SIGQUIT)
+            self.process.wait(_TIMEOUT_S)
         shutil.rmtree(self.root, ignore_errors=True)
         for suffix in ("pass", "log"):
             self.root.with_name(f"{self.root.name}.{suffix}").unlink()
