@@ -1,4 +1,5 @@
-"""Bugs to plant in the production core, one at a time: each changes a few words in one function's source.
+"""Bugs to plant in the production core or in the simulated shell, one at a time: each changes a few words in one
+function's source.
 
 A test plants each bug and requires that some seed fails; this shows that the simulation detects errors.
 """
@@ -11,6 +12,9 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
+
+from sim_coordinator import SimCoordinator
+from sim_store import Disk
 
 from evopolicy_coordinator.core import loading, machine
 from evopolicy_coordinator.core.agents import permits, precedence, requests
@@ -74,6 +78,30 @@ BUGS = (
     Bug("settle twice", Ledger, "_take", ".pop(submit_index, None)", ".get(submit_index)"),
     Bug("refund what is to be charged", submits, "end", "run.ledger.settle(", "run.ledger.refund("),
     Bug("send before persist", Step, "effects", "[first, *self._out]", "[*self._out, first]"),
+    Bug("let a deposed leader write", Disk, "admits", "term == self.incarnation", "True", seed=7),
+    Bug(
+        "reply before the commit",
+        SimCoordinator,
+        "_flush",
+        "effects, self._queue = self._queue, []",
+        "effects, self._queue = sorted(self._queue, key=lambda each: isinstance(each, Persist)), []",
+    ),
+    Bug(
+        "let two coordinators lead",
+        SimCoordinator,
+        "_step_down",
+        "life == self.life and",
+        "False and",
+        seed=7,
+    ),
+    Bug(
+        "refuse from memory after losing the lock",
+        SimCoordinator,
+        "_flush",
+        "isinstance(effect, Refuse) and not",
+        "False and not",
+        seed=1037,
+    ),
     Bug("forget to queue after a back-off", queue, "backed_off", "if job is not None", "if False"),
     Bug("forget the adoption timer", loading, "load", "if state.adopting:", "if False:"),
     Bug("forget the worker's timer", expiry, "check_due", "if deadlines:", "if False:"),

@@ -157,9 +157,17 @@ class Checkers:
         if isinstance(message, wire.ReportResults):
             self._handed_in.update(result.lease_id for result in message.results)
 
-    def answering(self, request: Message, message: Any) -> None:
-        """Check a reply that is about to be sent: its content is durable and may be reported."""
+    def answering(self, request: Message, message: Any, term: int) -> None:
+        """Check a reply that the coordinator of that incarnation is about to send: its content is durable and may be
+        reported. What a deposed leader accepts is durable too; its leases and refusals are as old as its memory."""
         disk = self._disk
+        if term != disk.incarnation:
+            if isinstance(message, wire.Leases) and isinstance(request, wire.LeaseRequest):
+                for lease in message.leases:
+                    self._grant(request.worker, lease, term)
+                return
+            if isinstance(message, wire.HeartbeatReply | wire.Refused):
+                return
         if isinstance(message, gateway.SubmitAccepted) and isinstance(request, gateway.Submit):
             row = disk.submits.get((request.run, message.submit_index))
             want(row is not None and row.key == request.key, "an accepted submit is durable", request, row)
@@ -202,7 +210,7 @@ class Checkers:
         """Check an acknowledged result: the worker now drops it."""
         group = result.job_id.rpartition("/")[0]
         job = None if self._core is None else self._core.state.jobs.get(result.job_id)
-        if result.begun is not None and job is not None and self._attempts[job.job_id] == result.attempt:
+        if result.begun is not None and job is not None and self._attempts.get(job.job_id) == result.attempt:
             row = self._disk.begun.get((group, job.first))
             want(row is not None and row.begun == result.begun, "what was handed back stands", result, row)
         parts = group.split("/")
@@ -228,12 +236,10 @@ class Checkers:
         highest = self._attempts.get(job.job_id, 0)
         want(lease.attempt > highest, "attempts grow, over restarts too", lease, highest)
         self._attempts[job.job_id] = lease.attempt
-        self._granted[lease.lease_id] = (worker, disk.incarnation)
-        self._granted_to[lease.job.job_id, lease.attempt] = (worker, disk.incarnation)
+        self._grant(worker, lease, disk.incarnation)
         for spec in job.episodes:
             want(disk.outcome(group, spec.index) is None, "what is done is not played again", lease)
         self._thrown_once(lease)
-        self._granted_at[lease.lease_id] = self._simulation.world.now
         able = self._simulation.workers.get(worker)
         want(able is None or job.env in able.envs, "a worker gets what it can play", worker, job.env)
         run, *_, split = group.split("/")
@@ -244,6 +250,11 @@ class Checkers:
         pin = disk.states[run].fingerprint_class
         mine = None if core is None else core.state.workers[worker].profile.classes[job.env]
         want(mine in (None, pin), "a run is played by its fingerprint class", worker, lease.lease_id)
+
+    def _grant(self, worker: str, lease: wire.Lease, term: int) -> None:
+        self._granted[lease.lease_id] = worker, term
+        self._granted_to[lease.job.job_id, lease.attempt] = worker, term
+        self._granted_at[lease.lease_id] = self._simulation.world.now
 
     def _thrown_once(self, lease: wire.Lease) -> None:
         """A hidden episode resumes from the actions that its policy had returned, unless its worker

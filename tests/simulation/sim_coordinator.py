@@ -3,11 +3,15 @@ crash.
 
 Effects are carried out as the contract requires, in order and a little later than the core requests them, while the
 core takes in more events: it runs ahead of its disk. The process may crash before any transaction and after any effect.
+Before any of both, a standby may get the lock: the old leader goes on beside it until it notices.
 """
 
 from __future__ import annotations
 
+import copy
+import zlib
 from collections.abc import Callable
+from math import inf
 from typing import Any
 
 from rigs.asking import asked
@@ -35,6 +39,8 @@ from evopolicy_coordinator.server.reason_texts import message
 PAGE = 5
 """Most episodes in a page."""
 FLUSH_S = 0.004
+CONFIRM_S = 1.0
+"""Longest time that a leader does not notice that it has lost the lock."""
 
 
 class Page:
@@ -57,6 +63,10 @@ class SimCoordinator:
         self._flushing = False
         self._stalled_until = 0.0
         self._woken_at: float | None = None
+        self._term = 0
+        self._leads_until = inf
+        self._deposed: SimCoordinator | None = None
+        """The last leader; half of the clients ask it as long as it serves."""
         self.start()
 
     # ---- life ----
@@ -64,7 +74,8 @@ class SimCoordinator:
     def start(self) -> None:
         self.life += 1
         self.disk.incarnation += 1
-        self._asks.clear()
+        self._term = self.disk.incarnation
+        self._asks = {}
         self._queue = []
         self._flushing = False
         self._woken_at = None
@@ -75,13 +86,39 @@ class SimCoordinator:
 
     def crash(self, why: str) -> None:
         """Lose all state that is not on disk; another process takes over later."""
-        if self.core is None:
-            return
-        self.world.note(f"coordinator dies: {why}")
+        if self.core is not None:
+            self._end(f"dies: {why}", 0.5 + self.world.chance.random() * 5.0)
+
+    def _end(self, why: str, again_s: float) -> None:
+        """Discards the core; it is loaded again, unless another coordinator leads."""
+        self.world.note(f"coordinator {self._term} {why}")
         self.core = None
         self.life += 1
         self._queue = []
-        self.world.after(0.5 + self.world.chance.random() * 5.0, self.start)
+        if self._leads_until == inf:
+            self.world.after(again_s, self.start)
+
+    def _lose_lead(self, effects: list[Effect]) -> None:
+        """The lock goes to a standby, which loads the rows at once or later. The old leader still has these effects to
+        carry out, and may be paused."""
+        world = self.world
+        world.note(f"coordinator {self._term} loses the lock")
+        old = copy.copy(self)
+        old._queue, old._flushing, old._woken_at = effects, False, None
+        old._leads_until = world.now + CONFIRM_S * world.chance.random()
+        if world.chance.random() < 0.3:
+            old.stall(world.chance.random() * 40.0)
+        old._take([])
+        world.after(old._leads_until - world.now, old._step_down, old.life)
+        self._deposed = old
+        self.core = None
+        self.life += 1
+        self._asks, self._queue = {}, []
+        world.after(world.chance.choice((0.0, world.chance.random() * 2.0)), self.start)
+
+    def _step_down(self, life: int) -> None:
+        if life == self.life and not self._later(self._step_down, life):
+            self._end("notices that it does not lead", inf)
 
     def stall(self, seconds: float) -> None:
         self.world.note(f"coordinator stands still for {seconds:.1f} s")
@@ -106,7 +143,13 @@ class SimCoordinator:
     ) -> None:
         """A request arrives, or arrived at `arrived` and is read now; `answer` delivers the reply."""
         arrived = self.world.now if arrived is None else arrived
+        old = self._deposed
+        if old is not None and old.core is not None and zlib.crc32(f"{endpoint} {old._term}".encode()) % 2:
+            old.receive(endpoint, kind, fields, answer, arrived)
+            return
         if self._later(self.receive, endpoint, kind, fields, answer, arrived):
+            return
+        if self.world.now > self._leads_until:
             return
         if kind is wire.LeaseRequest:
             fields = {**fields, "waited_s": self.world.now - arrived}
@@ -158,7 +201,11 @@ class SimCoordinator:
         stormy = world.now < world.calm_at
         self._flushing = False
         effects, self._queue = self._queue, []
-        for effect in effects:
+        for place, effect in enumerate(effects):
+            may_lose = stormy and faults.leader_lost and self._leads_until == inf
+            if may_lose and world.chance.random() < faults.leader_lost:
+                self._lose_lead(effects[place:])
+                return
             if isinstance(effect, Log):
                 world.note(f"log {effect.event} {effect.fields}")
                 self.checkers.logged(effect)
@@ -167,21 +214,21 @@ class SimCoordinator:
                     self.crash("before a transaction")
                     return
                 if stormy and world.chance.random() < faults.disk_error:
-                    self._reload()
+                    self._end("has a disk that refuses", 0.2)
+                    return
+                if not self.disk.admits(self._term):
+                    self._end("has lost its term", inf)
                     return
                 self.checkers.committing(effect.rows)
                 self.disk.write(effect.rows)
             else:
+                if isinstance(effect, Refuse) and not self.disk.admits(self._term):
+                    self._end("has lost its term", inf)
+                    return
                 self._carry_out(effect)
                 if stormy and world.chance.random() < faults.coordinator_crash:
                     self.crash("after an effect")
                     return
-
-    def _reload(self) -> None:
-        self.world.note("the disk refuses; the core is discarded")
-        self.core = None
-        self.life += 1
-        self.world.after(0.2, self.start)
 
     def _carry_out(self, effect: Reply | Refuse | ReadResults | ReadEvaluation | ReadFinished) -> None:
         who = self._asks.pop(int(effect.request), None)
@@ -190,7 +237,7 @@ class SimCoordinator:
         endpoint, answer, request = who
         message = self._message(effect)
         self.world.note(f"{endpoint} ← {message}")
-        self.checkers.answering(request, message)
+        self.checkers.answering(request, message, self._term)
         self.world.send(endpoint, answer, message)
 
     def _message(self, effect: Reply | Refuse | ReadResults | ReadEvaluation | ReadFinished) -> Any:

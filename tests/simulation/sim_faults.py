@@ -36,6 +36,8 @@ class Faults:
     """Per transaction: the coordinator crashes just before it."""
     coordinator_stall: float = 0.0
     """Per minute: the coordinator's loop is blocked for up to 40 s."""
+    leader_lost: float = 0.0
+    """Per effect, transactions included: another coordinator gets the lock just before it."""
     disk_error: float = 0.0
     """Per transaction: it fails."""
     liveness_flap: float = 0.0
@@ -71,6 +73,9 @@ RATES: dict[str, float] = {
     "liveness_flap": 3.0,
 }
 """The highest rate of each fault that a seed may draw."""
+
+LEADER_LOST = 0.04
+"""The rate of seeds with a standby, in addition to what they draw."""
 
 HARMLESS = ("liveness_flap", "coordinator_stall")
 """Faults that must not cause a single retry."""

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from sim_checkers import Checkers, ViolationError
 from sim_clients import SimGateway, SimOperator
 from sim_coordinator import SimCoordinator
-from sim_faults import HARMLESS, RATES, Faults, draw
+from sim_faults import HARMLESS, LEADER_LOST, RATES, Faults, draw
 from sim_oracle import PlannedRun, PlannedSubmit
 from sim_store import Disk
 from sim_stories import STORIES, SimEvaluator, Story
@@ -66,6 +66,8 @@ class Simulation:
         self.story = STORIES[seed % 16 // 2] if self.told else Story(title="")
         if self.told and seed % 64 < 32:
             faults = Faults()
+        if seed % 10 == 7 and not self.told and not self.crowd:
+            faults = replace(faults, leader_lost=LEADER_LOST)
         self.faults = faults
         self.harmless = faults == Faults() or all(
             getattr(faults, name) == getattr(Faults(), name)

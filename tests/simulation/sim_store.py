@@ -55,6 +55,10 @@ class Disk:
         self.kernels: dict[str, KernelRow] = {}
         self.journal: list[JournalRow] = []
 
+    def admits(self, term: int) -> bool:
+        """Whether the coordinator of that incarnation may write: no other has loaded the rows since."""
+        return term == self.incarnation
+
     def write(self, rows: Iterable[Row]) -> None:
         for row in rows:
             if isinstance(row, OutcomeRow):

@@ -89,6 +89,8 @@ class CoreHost:
         """How long the database took to confirm the lead, seconds; None in a state folder of its own."""
         self.leads_until = inf
         """Monotonic time after which nothing is answered unless the database confirms the lead again."""
+        self._unconfirmed: list[tuple[Callable[[], None], Callable[[], None]]] = []
+        self._confirming: asyncio.Task[None] | None = None
         self._unix_offset = time.time() - self._loop.time()
 
     def now(self) -> float:
@@ -134,6 +136,8 @@ class CoreHost:
         while self._outbox is not None and not self._outbox.idle:
             # Returns after all work submitted before it, including the flush that this work triggers.
             await self._writer.call(lambda store: None)
+        if self._confirming is not None:
+            await asyncio.gather(self._confirming, return_exceptions=True)
 
     def fail(self, part: str, error: BaseException) -> PartFailedError:
         """Stops serving, as the process must end. The state on disk stays, and the next process starts from it."""
@@ -171,6 +175,32 @@ class CoreHost:
                         LeadLostError(f"the database has not confirmed the lead for {LEAD_S:g} s: {why}")
                     )
             await asyncio.sleep(_CONFIRM_S)
+
+    def confirmed(self, then: Callable[[], None], otherwise: Callable[[], None]) -> None:
+        """Calls `then` once the database has confirmed the lead, and `otherwise` if it does not.
+
+        A refusal is final for a client. A coordinator that does not know yet that another leads must send none.
+        """
+        if self.leads_until == inf:
+            then()
+            return
+        self._unconfirmed.append((then, otherwise))
+        if self._confirming is None or self._confirming.done():
+            self._confirming = self._loop.create_task(self._confirm())
+
+    async def _confirm(self) -> None:
+        while batch := self._unconfirmed:
+            self._unconfirmed, confirmed = [], False
+            try:
+                if self.leads:
+                    await self._writer.call(Store.confirm)
+                    confirmed = True
+            except LeadLostError as error:
+                self.step_down(error)
+            except StorageError as error:
+                log.warning("the lead is not confirmed; refusals are not sent", error=str(error))
+            for then, otherwise in batch:
+                (then if confirmed else otherwise)()
 
     @property
     def leads(self) -> bool:

@@ -393,7 +393,7 @@ class Service:
         log.info("refused", key=query.key, status=error.status, why=error.message)
         answer = Refused(status=error.status, message=error.message)
         self._refused_workers.answered(query.key, query.payload, answer, self.host.now())
-        query.reply(answer_bytes(answer))
+        self.host.confirmed(lambda: query.reply(answer_bytes(answer)), query.drop)
 
     def _turn_away(self, query: IncomingQuery) -> None:
         """Without a core, serves what needs none while the store cannot be written, and drops all others."""
@@ -481,7 +481,10 @@ class Service:
             if isinstance(reply, operator.RunProgress):
                 reply = replace(reply, trouble=self._trouble)
             self._refused_workers.answered(query.key, query.payload, reply, self.host.now())
-            answer(reply)
+            if isinstance(effect, Refuse):
+                self.host.confirmed(lambda: answer(reply), query.drop)
+            else:
+                answer(reply)
         elif isinstance(effect, Log):
             getattr(log, effect.level)(effect.event, stimulus=effect.stimulus_id, **effect.fields)
 

@@ -17,7 +17,7 @@ import structlog
 from rigs.service_world import Requested, World, register, started
 from structlog.testing import capture_logs
 
-from evopolicy_common.errors import DamagedStoreError, PartFailedError
+from evopolicy_common.errors import DamagedStoreError, LeadLostError, PartFailedError
 from evopolicy_common.messages import gateway, operator, worker
 from evopolicy_common.messages.run_settings import RunSettings
 from evopolicy_common.messages.status import StatusRequest
@@ -26,6 +26,7 @@ from evopolicy_common.wire import keys
 from evopolicy_coordinator.core.contract.settings import CoreSettings
 from evopolicy_coordinator.core.machine import Core
 from evopolicy_coordinator.server import core_host, process, service
+from evopolicy_coordinator.storage.store import Store
 from evopolicy_coordinator.web.content.remarks import abandoned
 
 
@@ -78,6 +79,29 @@ async def test_an_unwritten_request_did_not_happen_and_may_be_repeated(tmp_path:
         assert isinstance(answer, gateway.SubmitAccepted)
         assert answer.submit_index == 0
         assert answer.remaining_budget == 98
+
+
+async def test_a_leader_refuses_nothing_once_another_one_has_loaded(tmp_path: Path) -> None:
+    """A gateway takes the refusal of a run as final, and another leader may have opened that run since."""
+
+    def submit(world: World, run: str) -> Requested:
+        message = gateway.Submit(run=run, token="t", key="k", env_instances=(0,), bundle=None)
+        return Requested(keys.gateway_key("c", run, "submit"), message)
+
+    async with started(tmp_path) as world:
+        created, host = await world.create(), world.service.host
+        host.leads_until = time.monotonic() + 60.0
+        assert (await world.answer(submit(world, "unknown"))).status == "bad_token"
+        with contextlib.closing(Store(tmp_path / "db")) as other:
+            other.load()
+        accepted = world.state(created)
+        refused = submit(world, "of-the-other")
+        world.ask(accepted, refused)
+        assert await accepted.message() is not None
+        assert await refused.message() is None
+        with pytest.raises(LeadLostError, match="taken over"):
+            host.failed.result()
+        assert not host.leads
 
 
 async def test_operators_are_answered_while_the_store_cannot_write(tmp_path: Path) -> None:
