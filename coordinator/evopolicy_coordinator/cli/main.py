@@ -66,6 +66,14 @@ def serve(
             " Default: as the state folder says, SQLite for a new one.",
         ),
     ] = None,
+    seal_key: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="Share the cluster's secrets with standbys: they are kept in the PostgreSQL database, sealed with the"
+            " key in this file (openssl rand -base64 32).",
+        ),
+    ] = None,
     data: Annotated[
         Path | None,
         typer.Option(
@@ -155,6 +163,7 @@ def serve(
         state=state or default_state_dir(),
         data=data,
         store=store,
+        seal_key=seal_key,
         listen=tuple(listen or ()),
         insecure_tcp=insecure_tcp,
         cluster=cluster,

@@ -26,6 +26,7 @@ from evopolicy_coordinator.core.contract.events import AnyEvent
 from evopolicy_coordinator.core.contract.records import latest_time
 from evopolicy_coordinator.core.contract.settings import CoreSettings
 from evopolicy_coordinator.core.machine import Core
+from evopolicy_coordinator.storage.sealing import SharedFiles
 from evopolicy_coordinator.storage.store import Store
 from evopolicy_coordinator.storage.writer import Outbox, Writer
 
@@ -85,6 +86,8 @@ class CoreHost:
         self.failed: asyncio.Future[None] = self._loop.create_future()
         """Ends with PartFailedError and the reason when a part of the service cannot continue, with LeadLostError when
         another coordinator leads."""
+        self.shared: SharedFiles | None = None
+        """The secrets that the coordinators of a database share."""
         self.store_latency_s: float | None = None
         """How long the database took to confirm the lead, seconds; None in a state folder of its own."""
         self.leads_until = inf
@@ -166,6 +169,7 @@ class CoreHost:
                 async with asyncio.timeout(max(0.0, self.leads_until - began)):
                     self.store_latency_s = await self._writer.call(Store.confirm)
                 self.leads_until = began + LEAD_S
+                await self.share()
             except LeadLostError as error:
                 self.step_down(error)
             except (StorageError, TimeoutError) as error:
@@ -175,6 +179,11 @@ class CoreHost:
                         LeadLostError(f"the database has not confirmed the lead for {LEAD_S:g} s: {why}")
                     )
             await asyncio.sleep(_CONFIRM_S)
+
+    async def share(self) -> None:
+        """Makes changed secrets known to the other coordinators. Raises StorageError."""
+        if self.shared is not None:
+            await self._writer.call(self.shared.push)
 
     def confirmed(self, then: Callable[[], None], otherwise: Callable[[], None]) -> None:
         """Calls `then` once the database has confirmed the lead, and `otherwise` if it does not.

@@ -37,7 +37,8 @@ from evopolicy_coordinator.server.service import Service
 from evopolicy_coordinator.server.uploads import Uploads
 from evopolicy_coordinator.splits import SplitSource, load_or_create_secret, secret_of
 from evopolicy_coordinator.storage.engines import Place, checked_address, chosen_place, record_place
-from evopolicy_coordinator.storage.state_folder import ROLES, StateFolder, reachable, resolve_listen
+from evopolicy_coordinator.storage.sealing import APPROVED, SharedFiles
+from evopolicy_coordinator.storage.state_folder import ROLES, StateFolder, held, reachable, resolve_listen
 from evopolicy_coordinator.storage.store import Store
 from evopolicy_coordinator.worlds import JOURNAL
 
@@ -55,6 +56,8 @@ class Options(msgspec.Struct, frozen=True, kw_only=True):
     """Folder of split files; None: derive the splits from the state folder's secret."""
     store: str | None = None
     """Address of a PostgreSQL database; None: as the state folder says, else SQLite."""
+    seal_key: Path | None = None
+    """File with the key that seals the secrets in the database; None: they are not shared."""
     listen: tuple[str, ...] = ()
     """Endpoints besides the unix socket in the state folder; port 0 picks a free port."""
     insecure_tcp: bool = False
@@ -80,13 +83,21 @@ async def run(options: Options, stop: asyncio.Event, on_ready: Callable[[Ready],
     """
     if options.store is not None:
         checked_address(options.store)  # before anything is created
+    place, why = chosen_place(options.state.absolute(), options.store), ""
+    shared = SharedFiles(options.state.absolute(), options.seal_key)
+    if isinstance(place, str):
+        with held(options.state.absolute()):  # before the folder gets an identity of its own
+            await asyncio.to_thread(shared.join, place)
+    elif options.seal_key is not None:
+        raise ConfigError(
+            "--seal-key: a store in the state folder is not shared; name a database with --store"
+        )
     with contextlib.closing(StateFolder.open(options.state, options.cluster)) as state:
         machines = Machines(state.root)
         listen = _listen(state, options, machines)
-        place, why = chosen_place(state.root, options.store), ""
         while not stop.is_set():
             try:
-                await _lead(options, state, place, machines, listen, stop, on_ready)
+                await _lead(options, state, place, shared, machines, listen, stop, on_ready)
                 break
             except DamagedStoreError:
                 raise
@@ -110,6 +121,7 @@ async def _lead(
     options: Options,
     state: StateFolder,
     place: Place,
+    shared: SharedFiles,
     machines: Machines,
     listening: tuple[tuple[str, ...], tuple[str, ...]],
     stop: asyncio.Event,
@@ -118,8 +130,12 @@ async def _lead(
     """Serves while this coordinator leads, until `stop`. Raises LeadLostError when another one leads."""
     listen, remote = listening
     async with contextlib.AsyncExitStack() as opened:
+        if isinstance(place, str):
+            await asyncio.to_thread(shared.join, place)  # while another one leads
         store = await asyncio.to_thread(Store, place, state.identity.operator_token)
         opened.callback(store.close)
+        if isinstance(place, str):
+            await asyncio.to_thread(lambda: shared.take(store.sealed()))
         secret, note = secret_of(state.root, unjailed=options.unjailed)
         if options.data is not None:
             note = ""
@@ -144,7 +160,7 @@ async def _lead(
         allowed = ("numpy", *options.allowed_packages)
         runs = RunRequests(reader, blobs, source, allowed_imports=allowed, denied_imports=SIMULATORS)
         definitions = Definitions(
-            state.root / "approved-environments.json",
+            state.root / APPROVED,
             shipped=catalogue.digests(),
             trusting=options.trust_workers,
         )
@@ -162,6 +178,8 @@ async def _lead(
         opened.push_async_callback(service.stop)
         await service.start()
         if isinstance(place, str):
+            service.host.shared = shared
+            await service.host.share()
             watching = asyncio.create_task(service.host.watch_lead())
             opened.callback(watching.cancel)
         queries, liveliness = service.on_queries, service.on_liveliness

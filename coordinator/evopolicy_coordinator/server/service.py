@@ -230,9 +230,10 @@ class Service:
             page = replace(page, undescribed=undescribed(workers), failed=failed(workers))
         return page
 
-    def _serve_approval(self, core: Core, query: IncomingQuery, parsed: Parsed) -> Message:
+    async def _serve_approval(self, core: Core, query: IncomingQuery, parsed: Parsed) -> Message:
         wanted, workers = parsed.message, core.state.workers.values()
         self._parser.definitions.approve(wanted.env, wanted.digest, workers)
+        await self.host.share()
         return operator.Done()
 
     def _pinned(self, core: Core, parsed: Parsed) -> Parsed:

@@ -21,16 +21,13 @@ import msgspec
 
 from evopolicy_common.errors import ConfigError, StorageError
 from evopolicy_common.records.blobs import BlobStore, fsync_directory, write_atomically
-from evopolicy_coordinator.pki.identity import SIGNING_KEY
-from evopolicy_coordinator.splits import SECRET, UNJAILED_SECRET
 from evopolicy_coordinator.storage.engines import DATABASE, Place, connect, place_of
 from evopolicy_coordinator.storage.moving import copy_rows
+from evopolicy_coordinator.storage.sealing import SHARED_FILES
 from evopolicy_coordinator.storage.store import Store
-from evopolicy_coordinator.worlds import JOURNAL
 
-_CERTS = ("ca.pem", "ca-key.pem", "coordinator.pem", "coordinator-key.pem", "machines.json")
 _TIMEOUT_S = 30.0
-KEPT_FILES = (SECRET, UNJAILED_SECRET, "identity.json", SIGNING_KEY, JOURNAL, *(f"certs/{n}" for n in _CERTS))
+KEPT_FILES = (*SHARED_FILES, "certs/coordinator.pem", "certs/coordinator-key.pem")
 """The cluster's identity, besides its database and blobs. A start creates everything else again."""
 
 

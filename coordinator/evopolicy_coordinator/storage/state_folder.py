@@ -9,6 +9,7 @@
       credentials/<role>.json     the credentials of workers, gateways and operators on this machine
       coordinator.sqlite          the authoritative state
       store                       the address of the PostgreSQL database that has it instead
+      sealed                      what of this folder that database has too, for standbys: see sealing.py
       blobs/                      trajectories, videos and policy bundles
       coordinator.sock            the socket for processes of this machine
 

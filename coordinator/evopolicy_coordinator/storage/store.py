@@ -185,6 +185,16 @@ class Store:
         with self._transaction():
             self._db.execute(f"INSERT INTO claims VALUES (?, ?, ?) {replace}", (suite, name, data))
 
+    def write_sealed(self, data: bytes) -> None:
+        """Stores the sealed secrets of the cluster durably. Raises StorageError when it fails."""
+        replace = "ON CONFLICT (run, kind) DO UPDATE SET data = excluded.data"
+        with self._transaction():
+            self._db.execute(f"INSERT INTO documents VALUES ('', 'secrets', ?) {replace}", (data,))
+
+    def sealed(self) -> bytes | None:
+        """The sealed secrets of the cluster; None without any."""
+        return _sealed(self._db)
+
     def claims(self) -> list[tuple[str, str, bytes]]:
         """All claims of sweeps: suite, name and stored bytes."""
         with self._db.errors():
@@ -278,6 +288,10 @@ class Reader:
         with self._db.errors():
             return self._db.execute(query, (run, digest)).fetchone() is not None
 
+    def sealed(self) -> bytes | None:
+        """As of `Store`; None also for an empty database."""
+        return _sealed(self._db)
+
     def _page(self, kind: type[T], where: str, args: tuple[Any, ...], max_bytes: int) -> tuple[T, ...]:
         """Rows of up to `max_bytes`, but at least one if there is any."""
         place = _PLACES[kind]
@@ -306,6 +320,14 @@ def rows(db: Database, kind: type[T], where: str = "", args: tuple[Any, ...] = (
                 f"table {place.table}, row ({key}) = {tuple(values)}: {unreadable(error)}"
             ) from error
         yield row
+
+
+def _sealed(db: Database) -> bytes | None:
+    with db.errors():
+        if not db.has_table("documents"):
+            return None
+        found = db.execute("SELECT data FROM documents WHERE run = '' AND kind = 'secrets'").fetchone()
+        return None if found is None else bytes(found[0])
 
 
 def _only(found: Iterator[T]) -> T | None:

@@ -9,6 +9,8 @@ import os
 import shutil
 import signal
 import socket
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import AsyncIterator, Callable, Iterator
@@ -27,6 +29,7 @@ from coordinator_harness import (
     run,
     working,
 )
+from cryptography.fernet import Fernet
 from machines.own_certs import CLUSTER, DAYS, free_port, now, of
 from machines.postgres import Server
 from rich.console import Console
@@ -54,21 +57,23 @@ def shown(status: StatusReply) -> str:
 
 
 class Pair:
-    """Two coordinators with the same secrets and blobs and a certificate each, and machines that know both."""
+    """Two coordinators with one key for the secrets, the same blobs, and a certificate each, and machines that know
+    both. The second one's folder begins empty."""
 
     def __init__(self, root: Path, secret: Path, address: str) -> None:
         self.root, self.address = root, address
         self.endpoints = tuple(f"tls/127.0.0.1:{free_port()}" for _ in range(2))
         self.members: list[Coordinator] = []
+        self.key = root / "seal-key"
+        self.key.touch(mode=0o600)
+        self.key.write_bytes(Fernet.generate_key())
         for index in range(2):
             folder = root / f"state-{index}"
             folder.mkdir(mode=0o700)
             if index == 0:
                 shutil.copy(secret, folder / "secret")
             else:
-                for name in ("identity.json", "secret", "signing-key"):
-                    shutil.copy(root / "state-0" / name, folder / name)
-                shutil.copytree(root / "state-0" / "certs", folder / "certs")
+                self._join(folder)
                 (folder / "blobs").symlink_to(root / "state-0" / "blobs")
             machines.init(folder, CLUSTER, ("127.0.0.1",), now(), DAYS, anew=False)
             if index == 0:
@@ -76,8 +81,22 @@ class Pair:
                     machines.issue(folder, CLUSTER, role, "m", self.endpoints, root / role, now(), DAYS)
             self.members.append(self.started(index, wait=index == 0))
 
+    def _join(self, folder: Path) -> None:
+        """As the guide says: the first start takes the secrets, and names the command for a certificate."""
+        command = [sys.executable, "-m", "evopolicy_coordinator.cli", "--state", str(folder)]
+        command += ["--store", self.address, "--listen", self.endpoints[1]]
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        assert "name the file with their key by --seal-key" in done.stderr
+        assert not (folder / "identity.json").exists()
+        done = subprocess.run(
+            [*command, "--seal-key", str(self.key)], capture_output=True, text=True, check=False
+        )
+        assert "certs init --state" in done.stderr
+        assert (folder / "secret").read_bytes() == (self.root / "state-0" / "secret").read_bytes()
+
     def started(self, index: int, *, wait: bool = False, address: str | None = None) -> Coordinator:
         options = ("--store", address or self.address, "--listen", self.endpoints[index])
+        options += ("--seal-key", str(self.key))
         return Coordinator(self.root / f"state-{index}", *options, wait=wait)
 
     def credentials(self, role: Role) -> Credentials:

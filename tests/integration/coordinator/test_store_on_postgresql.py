@@ -209,8 +209,10 @@ def test_commands_on_a_state_in_postgresql(golden: Path, server: Server, tmp_pat
         (each.env, each.train_episodes) for each in on_file
     ]
     assert disk_use.sizes(golden).database > 1 << 20
+    (golden / "approved-environments.json").write_text("{}")
     copied = backup.back_up(golden, tmp_path / "backup")
     assert copied.blobs == 4
+    assert (tmp_path / "backup" / "approved-environments.json").read_text() == "{}"
     for command, expected in (
         (["epoch", "list"], "journal: 2 entries"),
         (["identity"], ""),
