@@ -171,3 +171,5 @@ class StatusReply(Message, frozen=True, kw_only=True, tag="status_reply"):
     """The machine of the coordinator; of several on one database, the leader's."""
     store_latency_s: Number | None = None
     """How long the database took to confirm the lead; None where the rows are in a file."""
+    standbys: Many[Word] = ()
+    """The machines whose coordinators wait for the lead."""

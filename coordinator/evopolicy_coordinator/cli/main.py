@@ -18,6 +18,7 @@ from evopolicy_common.records.blobs import announcing
 from evopolicy_common.terminal import counted, say
 from evopolicy_common.wire.credentials import Ready, default_state_dir
 from evopolicy_coordinator.cli import certs as certs_cli
+from evopolicy_coordinator.cli import doctor as doctor_cli
 from evopolicy_coordinator.cli import epochs as epochs_cli
 from evopolicy_coordinator.cli import router_config
 from evopolicy_coordinator.cli import worlds as worlds_cli
@@ -37,6 +38,9 @@ app.command(
 app.command(
     "accept-worlds", epilog="Example: evopolicy-coordinator accept-worlds --state /var/lib/evopolicy"
 )(worlds_cli.accept_worlds)
+app.command(
+    epilog="Example: evopolicy-coordinator doctor --store postgresql://evopolicy@db/evopolicy",
+)(doctor_cli.doctor)
 app.command(
     "router-config",
     epilog="Example: evopolicy-coordinator router-config berlin --folder router-berlin"

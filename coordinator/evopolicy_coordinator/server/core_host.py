@@ -45,6 +45,8 @@ LEAD_S = 5.0
 """A coordinator answers nothing when the database has not confirmed its lead for this long, seconds. A server ends the
 session of a lost machine later than that."""
 _CONFIRM_S = 1.0
+_STANDBY_S = 10.0
+"""A standby asks for the lock again and again; between two attempts the database does not know of it."""
 
 
 class CoreHost:
@@ -90,6 +92,8 @@ class CoreHost:
         """The secrets that the coordinators of a database share."""
         self.store_latency_s: float | None = None
         """How long the database took to confirm the lead, seconds; None in a state folder of its own."""
+        self._standbys: dict[str, float] = {}
+        """Machines that wait for the lead, and the monotonic time when the database last said so."""
         self.leads_until = inf
         """Monotonic time after which nothing is answered unless the database confirms the lead again."""
         self._unconfirmed: list[tuple[Callable[[], None], Callable[[], None]]] = []
@@ -170,6 +174,7 @@ class CoreHost:
                     self.store_latency_s = await self._writer.call(Store.confirm)
                 self.leads_until = began + LEAD_S
                 await self.share()
+                self._standbys |= dict.fromkeys(await self._writer.call(Store.standbys), time.monotonic())
             except LeadLostError as error:
                 self.step_down(error)
             except (StorageError, TimeoutError) as error:
@@ -179,6 +184,12 @@ class CoreHost:
                         LeadLostError(f"the database has not confirmed the lead for {LEAD_S:g} s: {why}")
                     )
             await asyncio.sleep(_CONFIRM_S)
+
+    @property
+    def standbys(self) -> tuple[str, ...]:
+        """Machines whose coordinators wait for the lead."""
+        since = time.monotonic() - _STANDBY_S
+        return tuple(sorted(name for name, seen in self._standbys.items() if seen > since))
 
     async def share(self) -> None:
         """Makes changed secrets known to the other coordinators. Raises StorageError."""

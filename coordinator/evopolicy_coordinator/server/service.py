@@ -388,6 +388,7 @@ class Service:
             trouble=self._trouble,
             host=socket.gethostname(),
             store_latency_s=self.host.store_latency_s,
+            standbys=self.host.standbys,
         )
 
     def _refuse(self, query: IncomingQuery, error: RefusedError) -> None:

@@ -45,7 +45,7 @@ LOCK_WAIT_S = 4.0
 _NO_CHANGE = "the journal is only appended to"
 _LINK = {
     "connect_timeout": "10",
-    "application_name": "evopolicy",
+    "application_name": f"evopolicy {socket.gethostname()}",
     "tcp_user_timeout": "6000",
     "keepalives_idle": "3",
     "keepalives_interval": "1",
@@ -65,6 +65,14 @@ _ONE_WRITER = (
     "SELECT pg_advisory_lock(hashtext('evopolicy'), hashtext(current_schema()))",
     # A paused coordinator sends nothing, and the server ends its session with the lock.
     "SET idle_session_timeout = '20s'",
+)
+
+
+_COORDINATORS = (
+    "SELECT a.application_name, l.granted FROM pg_locks l JOIN pg_stat_activity a USING (pid)"
+    " WHERE l.locktype = 'advisory' AND a.datname = current_database()"
+    " AND l.classid::bigint = hashtext('evopolicy')::bigint & 4294967295"
+    " AND l.objid::bigint = hashtext(current_schema())::bigint & 4294967295 ORDER BY 2 DESC, 1"
 )
 
 
@@ -144,6 +152,10 @@ class Database(abc.ABC):
     @abc.abstractmethod
     def close(self) -> None:
         """Closes the connection."""
+
+    def coordinators(self) -> list[tuple[str, bool]]:
+        """The machines whose coordinators hold the database's lock or wait for it, and whether they lead."""
+        return []
 
     def abort(self) -> None:  # noqa: B027 - a file has no connection
         """Ends the connection from another thread, so that the operation in flight fails."""
@@ -275,6 +287,10 @@ class Postgres(Database):
     def close(self) -> None:
         if self.raw is not None:
             self.raw.close()
+
+    def coordinators(self) -> list[tuple[str, bool]]:
+        found = self.execute(_COORDINATORS).fetchall()
+        return [(name.removeprefix("evopolicy "), leads) for name, leads in found]
 
     def abort(self) -> None:
         raw = self.raw

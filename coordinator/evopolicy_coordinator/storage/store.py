@@ -168,6 +168,11 @@ class Store:
             pass
         return time.monotonic() - began
 
+    def standbys(self) -> list[str]:
+        """The machines whose coordinators wait for the lead."""
+        with self._db.errors():
+            return [name for name, leads in self._db.coordinators() if not leads]
+
     def abort(self) -> None:
         """Lets the operation of another thread fail."""
         self._db.abort()

@@ -32,6 +32,7 @@ from coordinator_harness import (
 from cryptography.fernet import Fernet
 from machines.own_certs import CLUSTER, DAYS, free_port, now, of
 from machines.postgres import Server
+from prometheus_client import CollectorRegistry
 from rich.console import Console
 
 from evopolicy_common.errors import RefusedError, TransportError
@@ -42,6 +43,7 @@ from evopolicy_common.wire.credentials import Credentials, Role
 from evopolicy_common.wire.transport import connect
 from evopolicy_coordinator.cli.status import render
 from evopolicy_coordinator.pki import machines
+from evopolicy_coordinator.server.monitoring.metrics import StatusCollector
 
 pytestmark = pytest.mark.cluster
 
@@ -284,7 +286,14 @@ def test_a_paused_leader_that_wakes_up_writes_nothing(
             status = await operator.status()
             assert status.host == socket.gethostname()
             assert status.store_latency_s is not None
-            assert " ms) ·" in shown(status)
+            assert " ms, standby: none) ·" in shown(status)
+            pair.members[1] = await asyncio.to_thread(pair.started, 1)
+            while not (status := await operator.status()).standbys:
+                await asyncio.sleep(0.1)
+            assert f" ms, standby: {socket.gethostname()}) ·" in shown(status)
+            sample = CollectorRegistry()
+            sample.register(StatusCollector(lambda: status))
+            assert sample.get_sample_value("evopolicy_standby", {"host": socket.gethostname()}) == 1
 
     with pair_of(tmp_path, secret, server.new()) as pair:
         run(lambda: scenario(pair), 180)

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import os
 import shutil
+import socket
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -228,6 +230,31 @@ def test_commands_on_a_state_in_postgresql(golden: Path, server: Server, tmp_pat
         assert len(reader.journal(0, 1 << 20)) == 2
 
 
+def test_doctor_checks_settings_and_names_coordinators(golden: Path, server: Server) -> None:
+    def doctor(*words: str) -> tuple[int, str]:
+        command = [sys.executable, "-m", "evopolicy_coordinator.cli", "doctor", *words]
+        done = subprocess.run(
+            command, capture_output=True, text=True, check=False, env={**os.environ, "COLUMNS": "200"}
+        )
+        return done.returncode, done.stdout + done.stderr
+
+    address = server.new()
+    assert "the rows are in" in doctor("--state", str(golden))[1]
+    code, text = doctor("--store", address)
+    # The tests' own server is started with -F.
+    assert (code, "set fsync = on" in text, "none is connected" in text) == (1, True, True)
+    assert "on this server alone" in text
+    move(golden, address)
+    server.query("postgres", "ALTER ROLE evopolicy SET synchronous_commit = off")
+    try:
+        with contextlib.closing(Store(address)) as store:
+            assert f"{socket.gethostname()} leads" in (text := doctor("--state", str(golden))[1])
+            assert "loses accepted submits" in text
+            assert store.standbys() == []
+    finally:
+        server.query("postgres", "ALTER ROLE evopolicy RESET synchronous_commit")
+
+
 def test_one_coordinator_at_a_time_uses_a_database(
     tmp_path: Path, server: Server, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -242,7 +269,7 @@ def test_one_coordinator_at_a_time_uses_a_database(
         ours.load()
         server.query(
             "postgres",
-            "SELECT pg_terminate_backend(pid) FROM pg_stat_activity WHERE application_name = 'evopolicy'",
+            "SELECT pg_terminate_backend(pid) FROM pg_stat_activity WHERE application_name LIKE 'evopolicy %'",
         )
         with contextlib.closing(Store(address, "one")) as other:
             other.load()

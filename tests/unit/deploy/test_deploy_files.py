@@ -21,12 +21,14 @@ from collections.abc import Iterator
 from importlib import metadata
 from pathlib import Path
 from typing import Any
+from urllib.parse import urlsplit
 
 import pytest
 import yaml
 from documents import APPS, blocks_of_commands, parse
 
 from evopolicy_common.cli.conventions import USAGE_ERROR
+from evopolicy_coordinator.storage.engines import checked_address
 
 ROOT = Path(__file__).parents[3]
 DEPLOY = ROOT / "deploy"
@@ -202,26 +204,30 @@ def test_the_dockerfile_copies_what_there_is_and_installs_what_was_tested(tmp_pa
             parse(yaml.safe_load(rest))
 
 
-def compose() -> dict[str, Any]:
-    loaded: dict[str, Any] = yaml.safe_load((DEPLOY / "compose.yaml").read_text())
+COMPOSE_FILES = ("compose.yaml", "compose-postgresql.yaml")
+
+
+def compose(name: str = COMPOSE_FILES[0]) -> dict[str, Any]:
+    loaded: dict[str, Any] = yaml.safe_load((DEPLOY / name).read_text())
     return loaded
 
 
-def test_the_compose_file_has_services_that_start_with_options_that_they_take() -> None:
-    services = compose()["services"]
+@pytest.mark.parametrize("file", COMPOSE_FILES)
+def test_a_compose_files_services_start_with_options_that_they_take(file: str) -> None:
+    services = compose(file)["services"]
     known = {
         *("image", "build", "restart", "init", "read_only", "tmpfs", "cap_drop", "command", "volumes"),
-        *("security_opt", "ports", "depends_on", "user"),
+        *("security_opt", "ports", "depends_on", "user", "environment"),
     }
     for name, service in services.items():
         assert service.keys() <= known
-        if name != "router":
+        if name not in ("router", "database"):
             assert service["command"][0] in APPS
             parse(service["command"])
             assert (DEPLOY / service["build"]["context"] / service["build"]["dockerfile"]).is_file()
         for volume in service["volumes"]:
             source = volume.partition(":")[0]
-            assert source.startswith("./") or source in compose()["volumes"]
+            assert source.startswith("./") or source in compose(file)["volumes"]
         assert set(service.get("depends_on", [])) <= services.keys()
 
 
@@ -238,8 +244,29 @@ def test_the_compose_files_router_matches_our_zenoh_and_offers_nothing_else() ->
     assert users == [router["user"]], "the router reads folders that the image's user owns"
 
 
-def test_only_the_workers_container_leaves_dockers_filters() -> None:
-    for name, service in compose()["services"].items():
+def test_two_coordinators_of_a_compose_file_share_database_key_and_blobs() -> None:
+    services = compose(COMPOSE_FILES[1])["services"]
+    first, second = services["first"], services["second"]
+    assert first["command"] == second["command"]
+    options = dict(word.split("=", 1) for word in first["command"][1:])
+    checked_address(options["--store"])
+    assert urlsplit(options["--store"]).hostname in services
+    assert {"./machines/blobs:/state/blobs", "./machines/coordinators:/keys:ro"} <= {*first["volumes"]} & {
+        *second["volumes"]
+    }
+    # Attack: the database's server opens the sealed secrets in it. Defence: it does not get the key.
+    mounted = [each.split(":")[0] for each in services["database"]["volumes"]]
+    assert mounted == ["database", "./machines/password"]
+    tested = re.search(
+        r"^Tested with PostgreSQL (\d+)", (ROOT / "docs/how-to/postgresql.md").read_text(), re.MULTILINE
+    )
+    assert tested is not None
+    assert services["database"]["image"] == f"postgres:{tested[1]}"
+
+
+@pytest.mark.parametrize("file", COMPOSE_FILES)
+def test_only_the_workers_container_leaves_dockers_filters(file: str) -> None:
+    for name, service in compose(file)["services"].items():
         assert service["cap_drop"] == ["ALL"]
         assert service["read_only"] is True
         outer = {option for option in service["security_opt"] if option != "no-new-privileges:true"}
@@ -265,7 +292,8 @@ def test_the_page_on_docker_has_the_options_of_the_compose_file() -> None:
     parse(words[words.index("evopolicy:latest") + 1 :])
 
 
-def test_docker_takes_the_compose_file() -> None:
+@pytest.mark.parametrize("file", COMPOSE_FILES)
+def test_docker_takes_the_compose_file(file: str) -> None:
     docker = shutil.which("docker")
     if docker is None or subprocess.run([docker, "compose", "version"], capture_output=True).returncode:
         pytest.skip(
@@ -273,7 +301,7 @@ def test_docker_takes_the_compose_file() -> None:
             "see docs.docker.com/compose/install"
         )
     done = subprocess.run(
-        [docker, "compose", "--file", str(DEPLOY / "compose.yaml"), "config", "--quiet"],
+        [docker, "compose", "--file", str(DEPLOY / file), "config", "--quiet"],
         capture_output=True,
         text=True,
         timeout=100,

@@ -134,6 +134,11 @@ class StatusCollector(Collector):
         if status.store_latency_s is not None:
             text = "How long PostgreSQL took to confirm that this coordinator leads."
             yield _gauge("evopolicy_store_latency_seconds", text, status.store_latency_s)
+            text, standbys = (
+                "1 for each machine that waits for the lead.",
+                {(name,): 1 for name in status.standbys},
+            )
+            yield _gauges("evopolicy_standby", text, ("host",), standbys)
         yield CounterMetricFamily(
             "evopolicy_cluster_episodes",
             "Episodes that the cluster has played since its coordinator started.",

@@ -9,9 +9,11 @@ from evopolicy_common.terminal import duration
 
 
 def served_by(reply: StatusReply) -> str:
-    """The coordinator's machine, and the latency of its database if it has one."""
+    """The coordinator's machine, and for a database of its own its latency and the standbys' machines."""
     latency = reply.store_latency_s
-    return reply.host if latency is None else f"{reply.host} (database {1000 * latency:.0f} ms)"
+    if latency is None:
+        return reply.host
+    return f"{reply.host} (database {1000 * latency:.0f} ms, standby: {', '.join(reply.standbys) or 'none'})"
 
 
 def remarks(reply: StatusReply) -> Mapping[str, Iterable[str]]:
