@@ -21,14 +21,17 @@ from pathlib import Path
 from typing import IO, Any, Literal
 
 from coordinator_harness import OperatorClient
+from cryptography.fernet import Fernet
 from host_faults import Cable, Clock, Disks
 from machines.own_processes import only_what_starts_inside
+from machines.postgres import Server
 from weak_link import WeakLink
 
 from evopolicy_common.messages import operator
 from evopolicy_common.processes import proc
 from evopolicy_common.wire import credentials
 from evopolicy_common.wire.transport import connect
+from evopolicy_coordinator.storage.engines import connect as connect_to_database
 from evopolicy_gateway.processes import trees as processes
 
 SUBMITS = 3
@@ -51,9 +54,10 @@ KINDS = {
 }
 """Words of a process's program, and of its command line."""
 ZYGOTE_DEPTH = 2 if os.geteuid() == 0 else 0
-Site = Literal["one host", "two hosts", "relay", "clock that jumps", "bad disks"]
+Site = Literal["one host", "two hosts", "relay", "clock that jumps", "bad disks", "two coordinators"]
 """One host: worker and coordinator by a unix socket that `WeakLink` passes on. Two hosts: by TCP over a cable. Relay:
-all by TCP that `WeakLink` passes on, gateways and commands too."""
+all by TCP that `WeakLink` passes on, gateways and commands too. Two coordinators: on one PostgreSQL database, and all
+know both by TCP."""
 
 AGENT = '''
 import http.client, json, os, pathlib, sys, time, urllib.error, urllib.request
@@ -186,7 +190,20 @@ class FaultCluster:
         if self.cable is not None or site == "relay":
             # Of a network namespace of our own, so the port is free, and the same when it is started again.
             coordinator.append(f"tcp/{Cable.NEAR if self.cable is not None else '127.0.0.1'}:{PORT}")
-        self.coordinator = Kept(coordinator, root / "coordinator.log", self._environment)
+        self.server: Server | None = None
+        self.standby: Kept | None = None
+        more: dict[str, str] = {}
+        if site == "two coordinators":
+            self.server = Server()
+            stack.callback(self.server.close)
+            self.database = self.server.new()
+            key = root / "seal-key"
+            key.touch(mode=0o600)
+            key.write_bytes(Fernet.generate_key())
+            self._environment |= {"PGPASSFILE": str(self.server.passfile), "FAULTS_SEAL_KEY": str(key)}
+            coordinator.append(f"tcp/127.0.0.1:{PORT}")
+            more = {"FAULTS_STORE": f"{self.database}?application_name=first"}
+        self.coordinator = Kept(coordinator, root / "coordinator.log", self._environment | more)
         stack.callback(self.coordinator.end)
         deadline = time.monotonic() + TIMEOUT_S
         while not self._ready.exists():
@@ -195,6 +212,16 @@ class FaultCluster:
         ready = json.loads(self._ready.read_text())
         self.files: dict[str, str] = ready["credentials"]
         self.link: WeakLink | None = None
+        if self.server is not None:
+            other = root / "standby"
+            other.mkdir(mode=0o700)
+            (other / "blobs").symlink_to(self.state / "blobs")
+            program = [sys.executable, str(launcher), str(other), str(root / "standby.json")]
+            program.append(f"tcp/127.0.0.1:{PORT + 1}")
+            more = {"FAULTS_STORE": f"{self.database}?application_name=second"}
+            self.standby = Kept(program, root / "standby.log", self._environment | more)
+            stack.callback(self.standby.end)
+            self._reach(f"tcp/127.0.0.1:{PORT}", f"tcp/127.0.0.1:{PORT + 1}")
         if site == "relay":
             port = int(ready["endpoints"][-1].rpartition(":")[2])
             self.link = WeakLink(("127.0.0.1", 0), ("127.0.0.1", port))
@@ -205,7 +232,7 @@ class FaultCluster:
         worker += ["--grace", "1", "--credentials", self.files["worker"]]
         if self.cable is not None:
             worker = [*self.cable.at_its_far_end, *worker, "--connect", ready["endpoints"][-1]]
-        elif self.link is None:
+        elif self.link is None and self.server is None:
             self.link = WeakLink(root / "link.sock", self.state / "coordinator.sock")
             stack.callback(self.link.close)
             worker += ["--connect", f"unixsock-stream/{root / 'link.sock'}"]
@@ -219,7 +246,7 @@ class FaultCluster:
         for leaves, path in self._agents.items():
             path.write_text(_agent(leaves))
 
-    def _reach(self, endpoint: str) -> None:
+    def _reach(self, *endpoints: str) -> None:
         """All roles reach the coordinator there alone."""
         folder = self.root / "credentials"
         folder.mkdir(mode=0o700)
@@ -227,7 +254,7 @@ class FaultCluster:
             found = json.loads(Path(path).read_text())
             self.files[role] = str(folder / Path(path).name)
             Path(self.files[role]).touch(mode=0o600)
-            Path(self.files[role]).write_text(json.dumps(found | {"endpoints": [endpoint]}))
+            Path(self.files[role]).write_text(json.dumps(found | {"endpoints": endpoints}))
 
     @property
     def operators(self) -> credentials.Credentials:
@@ -289,6 +316,9 @@ class FaultCluster:
 
     def find(self, kind: str) -> list[int]:
         """Processes of that kind now, in order of their ids."""
+        if kind == "leader":
+            leader = self.leader()
+            return [] if leader is None else [leader.process.pid]
         if kind == "coordinator":
             return [self.coordinator.process.pid]
         if kind == "worker":
@@ -304,10 +334,24 @@ class FaultCluster:
             found = [pid for pid in found if (depths[pid] == ZYGOTE_DEPTH + 1) == (kind == "policy")]
         return found
 
+    def leader(self) -> Kept | None:
+        """Of two coordinators on one database, the one that leads, once the other one waits."""
+        assert self.server is not None
+        address = f"{self.database}?passfile={self.server.passfile}"
+        with contextlib.closing(connect_to_database(address, "ro", 10.0)) as db:
+            deadline = time.monotonic() + TIMEOUT_S
+            while sorted((known := dict(db.coordinators())).values()) != [False, True]:
+                assert time.monotonic() < deadline, known
+                time.sleep(0.05)
+        return self.coordinator if known["first"] else self.standby
+
     def strays(self) -> list[str]:
         """What lives below this process beside the coordinator, the worker and what the worker's slots need."""
         here = os.getpid()
         kept = {self.coordinator.process.pid, *self.find("worker")}
+        if self.server is not None and self.standby is not None:
+            kept |= {self.standby.process.pid, self.server.process.pid}
+            kept |= set(proc.descendants(self.server.process.pid))
         if self.cable is not None:
             kept.add(self.cable.holder.pid)
         of_workers = {pid for worker in self.find("worker") for pid in proc.descendants(worker)}

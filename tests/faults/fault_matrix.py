@@ -32,6 +32,7 @@ from coordinator_harness import OperatorClient
 from fault_cluster import EPISODES, SUBMITS, TIMEOUT_S, TOTAL, FaultCluster, Site, fault_cluster, record
 from host_faults import enter_namespaces, full_file_system, out_of_memory, read_only_mount
 from machines.cgroups import NoCgroupError
+from machines.postgres import programs
 from weak_link import How
 
 from evopolicy_common.errors import RefusedError, TransportError
@@ -51,6 +52,9 @@ SLOW_S = 2.0
 PARTITION_S = 150.0
 SLOW_DISK_S = 5.0
 JUMPS_H = {"5 h forward": 5, "5 h back": -5, "5 h back, all restarted": -5, "1 h forward": 1, "1 h back": -1}
+LEAD_LOST_S = 25.0
+"""Longer than a paused leader has the lock of the database."""
+DATABASE_GONE_S = 2.0
 DISK_ERRORS = {"over quota": errno.EDQUOT, "read-only": errno.EROFS, "input/output error": errno.EIO}
 TARGETS = ("coordinator", "worker", "slot", "zygote", "gateway", "supervisor", "run")
 ONE_HOST = (
@@ -86,6 +90,11 @@ FAULTS: dict[Site, tuple[tuple[str, str], ...]] = {
         ("relay", "reordered"),
     ),
     "clock that jumps": tuple(("clock", jump) for jump in JUMPS_H),
+    "two coordinators": (
+        ("leader", "SIGKILL"),
+        ("leader", "SIGSTOP past its lead"),
+        ("database", "SIGKILL"),
+    ),
     "bad disks": tuple(
         (disk, fault) for disk in ("state", "runs") for fault in (*DISK_ERRORS, "1 s more for each fsync")
     ),
@@ -96,6 +105,7 @@ SELECTED = frozenset(
     {
         *((target, "SIGKILL") for target in (*TARGETS, "everything")),
         ("worker", "SIGSTOP past its leases"),
+        ("leader", "SIGKILL"),
         ("coordinator", "file system full"),
         ("run", "file system full"),
         ("link", "cut"),
@@ -169,6 +179,9 @@ def cases(seeds: int, part: int = 0, parts: int = 1, first: int = 0) -> list[Cas
     """
     found = []
     for number, (site, faults) in enumerate(FAULTS.items()):
+        if site == "two coordinators" and programs() is None:
+            print(f"not played: {site}, which needs PostgreSQL: apt-get install postgresql", file=sys.stderr)
+            continue
         of_site = [
             Case(target, fault, seed, site)
             for seed in range(first, first + (seeds or 1))
@@ -220,6 +233,12 @@ def strike(cluster: FaultCluster, case: Case, row: Row) -> bool:
         with read_only_mount(cluster.state if case.target == "coordinator" else cluster.runs):
             time.sleep(DISK_FULL_S)
         return True
+    if case.target == "database":
+        assert cluster.server is not None
+        cluster.server.kill()
+        time.sleep(DATABASE_GONE_S)
+        cluster.server.start()
+        return True
     if case.target == "everything":
         kill([pid for kind in ("run", "coordinator", "worker") for pid in cluster.find(kind)])
         return True
@@ -240,6 +259,9 @@ def strike(cluster: FaultCluster, case: Case, row: Row) -> bool:
             except NoCgroupError as error:
                 print(f"not played: {error}", file=sys.stderr)
                 return False
+        elif case.fault == "SIGSTOP past its lead":
+            with stopped([pid]):
+                time.sleep(LEAD_LOST_S)
         elif case.fault == "no file may grow":
             with full_disk(pid):
                 time.sleep(DISK_FULL_S)

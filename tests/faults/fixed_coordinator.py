@@ -4,6 +4,7 @@ on it can be compared byte for byte (random actions and policies' generators are
 from __future__ import annotations
 
 import asyncio
+import os
 import signal
 import sys
 from pathlib import Path
@@ -34,9 +35,17 @@ async def serve(state: Path, ready_file: Path, listen: tuple[str, ...]) -> None:
     def on_ready(ready: process.Ready) -> None:
         write_atomically(ready_file, msgspec.json.encode(ready), mode=0o600)
 
-    await process.run(
-        process.Options(state=state, listen=listen, insecure_tcp=True, core=SETTINGS), stop, on_ready
+    # Of coordinators on one database.
+    store, key = os.environ.get("FAULTS_STORE"), os.environ.get("FAULTS_SEAL_KEY")
+    options = process.Options(
+        state=state,
+        listen=listen,
+        insecure_tcp=True,
+        core=SETTINGS,
+        store=store,
+        seal_key=None if key is None else Path(key),
     )
+    await process.run(options, stop, on_ready)
 
 
 if __name__ == "__main__":
