@@ -44,6 +44,7 @@ from evopolicy_common.wire.transport import connect
 from evopolicy_coordinator.cli.status import render
 from evopolicy_coordinator.pki import machines
 from evopolicy_coordinator.server.monitoring.metrics import StatusCollector
+from evopolicy_coordinator.storage.engines import connect as connect_to_database
 
 pytestmark = pytest.mark.cluster
 
@@ -103,6 +104,12 @@ class Pair:
 
     def credentials(self, role: Role) -> Credentials:
         return of(self.root / ("worker" if role == "worker" else "operator"), role)
+
+    def await_standby(self) -> None:
+        """Returns once one waits for the lock. A killed coordinator is back after the start of a process."""
+        with contextlib.closing(connect_to_database(self.address, "ro", 10.0)) as db:
+            while all(leads for _, leads in db.coordinators()):
+                time.sleep(0.02)
 
     def leads_after(self, index: int) -> float:
         """Wall time until that coordinator serves, seconds."""
@@ -212,7 +219,8 @@ def test_a_killed_leader_costs_time_and_nothing_else(
 
     def kill(pair: Pair, ended: threading.Event) -> None:
         leader = 0
-        while not ended.wait(2.0):
+        while not ended.wait(0.4):
+            pair.await_standby()
             pair.members[leader].kill()
             took.append(pair.leads_after(1 - leader))
             pair.members[leader] = pair.started(leader)
@@ -242,6 +250,7 @@ def test_many_leader_changes_lose_and_repeat_no_request(
                 for _ in range(3):
                     key = f"run-{len(created)}"
                     created[key] = (await patiently(lambda: operator.create(key))).run  # noqa: B023
+                await asyncio.to_thread(pair.await_standby)
                 end = pair.members[leader].kill if changes % 2 else pair.members[leader].stop
                 # This one is sent while the leader ends.
                 key = f"run-{len(created)}"
