@@ -136,9 +136,9 @@ class View(ABC):
         self.waits_for(run, progress.waits_for)
 
     def waits_for(self, run: str, what: str, kind: str = "waits") -> None:
-        """Stores the reason for the run's wait; reports it once."""
+        """Stores the reason for the run's wait; reports each reason once."""
         self.row(run).waits_for = what
-        if what not in self.no_news and self.is_new(run, "waits", what):
+        if what not in self.no_news and self.is_new(run, f"waits for {what}", True):
             self.event(kind, run, what=what)
 
     def row(self, run: str) -> Row:

@@ -37,15 +37,15 @@ def notify_if_slow(what: str, after_s: float = AFTER_S) -> Iterator[None]:
 
 
 class Waiting:
-    """Filters repeated reports of what something waits for: new reasons are shown once, after a long enough wait."""
+    """Filters repeated reports of what something waits for: each reason is shown once, after a long enough wait."""
 
     def __init__(self) -> None:
+        self._said: set[str] = set()
         self.ended()
 
     def ended(self) -> None:
         """The wait is over: the next one counts from now."""
         self._since = asyncio.get_running_loop().time()
-        self._last = ""
 
     def worth_saying(self, what: str) -> bool:
         """Whether to report now that it waits for `what`; an empty `what` means that it does not wait."""
@@ -54,7 +54,7 @@ class Waiting:
             return False
         # 0.9: callers poll every few seconds, so a check just before the limit would delay the notice by a whole round.
         slow = asyncio.get_running_loop().time() - self._since > 0.9 * AFTER_S
-        if not slow or what == self._last:
+        if not slow or what in self._said:
             return False
-        self._last = what
+        self._said.add(what)
         return True

@@ -17,6 +17,7 @@ from evopolicy_common.console import Terminal, progress_bars
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.local.cluster import LocalCluster, local_cluster, unless_failed
 from evopolicy_common.messages.episode import Tier
+from evopolicy_common.processes.notices import Waiting
 from evopolicy_common.wire import credentials, transport
 from evopolicy_results.evaluations import Evaluations
 
@@ -118,7 +119,7 @@ class Playing:
         self.evaluations = Evaluations(link, self._played, own=cluster is not None)
         self._cluster, self._progress = cluster, progress
         self._task = progress.add_task(title, total=None)
-        self._shown_reasons: set[str] = set()
+        self._waiting = Waiting()
 
     def update(self, *, total: int | None = None, title: str | None = None) -> None:
         """Sets the number of episodes to come, or the bar's title."""
@@ -126,9 +127,8 @@ class Playing:
 
     def _played(self, count: int, waits_for: str) -> None:
         self._progress.update(self._task, completed=count)
-        if waits_for and waits_for not in self._shown_reasons:
-            self._shown_reasons.add(waits_for)
-            self._progress.console.print(f"waits for {waits_for}")
+        if self._waiting.worth_saying(waits_for):
+            self._progress.console.print(f"waiting for {waits_for}", soft_wrap=True)
 
     async def play(
         self, envs: list[str], tiers: set[Tier], work: Callable[[], Coroutine[Any, Any, None]]

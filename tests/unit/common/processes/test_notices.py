@@ -7,6 +7,7 @@ import os
 import pytest
 
 from evopolicy_common.cli.conventions import setup_notices
+from evopolicy_common.processes import notices
 from evopolicy_common.processes.notices import MANY_SLOTS, notify_of_many_slots
 
 
@@ -17,3 +18,15 @@ def test_more_slots_than_cores_can_play_are_told(capsys: pytest.CaptureFixture[s
     assert capsys.readouterr().err == ""
     notify_of_many_slots(most + 1)
     assert f"{most + 1} slots on" in capsys.readouterr().err
+
+
+async def test_a_reason_to_wait_is_worth_saying_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(notices, "AFTER_S", 0.0)
+    waiting = notices.Waiting()
+    assert waiting.worth_saying("a worker")
+    waiting.ended()
+    assert not waiting.worth_saying("a worker")
+    assert waiting.worth_saying("an agent to end")
+    assert not waiting.worth_saying("")
+    monkeypatch.setattr(notices, "AFTER_S", 1000.0)
+    assert not waiting.worth_saying("a slot")  # a short wait

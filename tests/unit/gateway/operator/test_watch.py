@@ -55,7 +55,7 @@ def test_a_runs_wait_is_told_once() -> None:
     console = Terminal(file=out, width=200)
     missing = "a worker that offers toy/line with sandbox tier bwrap"
     for view in (RunView(console), SuiteView(["run"], 1, console)):
-        for what in (missing, missing, ""):
+        for what in (missing, missing, "", "an agent to end", missing):
             view.phase("run", RunProgress(phase="heldout", done=0, total=4, waits_for=what))
     assert out.getvalue().count(f"waiting for {missing}") == 2
     sweep = SuiteView(["run"], 1, console)
