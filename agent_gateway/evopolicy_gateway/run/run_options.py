@@ -357,10 +357,10 @@ class ClusterOptions(msgspec.Struct, frozen=True, kw_only=True):
 
     slots: Annotated[int, Meta(ge=1, le=1024)] = 2
     """Episodes that the local worker plays at the same time. Environments in a virtual environment of their own have a
-    worker with as many."""
+    worker with as many. Commands that share a cluster add their slots."""
     state: Path | None = None
     """State folder of the local cluster. Default: $XDG_STATE_HOME/evopolicy/local, which all your local runs share, so
-    that they have the same cases."""
+    that they have the same cases. Commands with the same folder share a cluster while they run."""
     fresh: bool = False
     """Use a temporary state folder: new cases, and no later comparison or `verify`."""
     data: Path | None = None

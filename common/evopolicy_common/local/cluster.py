@@ -2,6 +2,9 @@
 
 Rules: they end with the command, however it ends; workers end first, so that they return their leases. A process that
 dies is restarted and resumes its work. One that refuses its options, or dies repeatedly, is an error.
+
+Commands with one state folder share the cluster: each brings a coordinator and workers. One coordinator serves; the
+others wait, and one of them takes its place when it ends, however it ends. Every worker plays episodes of all commands.
 """
 
 from __future__ import annotations
@@ -9,10 +12,11 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import fcntl
+import json
 import os
 import sys
 import time
-from collections.abc import AsyncIterator, Awaitable, Callable, Collection, Iterable, Sequence
+from collections.abc import AsyncIterator, Awaitable, Callable, Collection, Iterable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
@@ -20,8 +24,9 @@ from typing import Any, NamedTuple, TypeVar
 from evopolicy_common import catalogue
 from evopolicy_common.catalogue import installs
 from evopolicy_common.cli.conventions import FAILURE, USAGE_ERROR
-from evopolicy_common.errors import ConfigError
+from evopolicy_common.errors import ConfigError, EvopolicyError
 from evopolicy_common.messages.episode import Tier
+from evopolicy_common.processes import host
 from evopolicy_common.processes.child_process import ChildProcess, last_words
 from evopolicy_common.processes.notices import notify_if_slow, notify_of_many_slots
 from evopolicy_common.processes.preflight import LOCAL, check_installed, check_scratch, check_writable
@@ -29,26 +34,21 @@ from evopolicy_common.processes.scratch import scratch_folder
 from evopolicy_common.records.blobs import write_atomically
 from evopolicy_common.records.open_run import is_held
 from evopolicy_common.wire import credentials, transport
-from evopolicy_common.wire.credentials import Ready, read_ready
+from evopolicy_common.wire.credentials import WORKERS, Ready, read_ready
 from evopolicy_common.wire.operator_client import OperatorClient
 
 T = TypeVar("T")
 START_TIMEOUT_S = 60.0
 END_GRACE_S = 10.0
 _RESTART_PAUSE_S = 0.5
+_LOOK_S = 5.0
+"""Between searches for runs of killed commands, seconds."""
 _LONGEST_PAUSE_S = 5.0
 _MAX_DEATHS = 10
 """Number of successive deaths, each within `_SOON_S` seconds of its start, that counts as an error."""
 _SOON_S = 60.0
 _IN_VAIN = ("ModuleNotFoundError: ", "ImportError: ", "SyntaxError: ")
 """Beginnings of last words after which another start would end in the same way."""
-
-
-WORKERS_ENDED = "workers-ended"
-"""File in a kept state folder: all workers of its last command have ended; the next coordinator expects none."""
-PROCESSES = "processes"
-"""File in a kept state folder that the last command and its processes lock as long as one of them lives. A coordinator
-removes it when it starts, since workers that no local command started may join."""
 
 
 class Workers(NamedTuple):
@@ -96,16 +96,18 @@ class LocalCluster:
 
 
 async def _start_workers(
-    processes: _Processes, options: Sequence[str], credentials: Sequence[str], wanted: Workers
+    processes: _Processes, locks: Path, options: Sequence[str], credentials: Sequence[str], wanted: Workers
 ) -> None:
     notify_of_many_slots(wanted.slots or 0)
+    locks.mkdir(mode=0o700, exist_ok=True)
     for python, env_ids in installs.divided(wanted.env_ids).items():
         # --unsandboxed: whoever starts this cluster also chooses the tiers of its runs.
         program = [*_module("evopolicy_worker.cli", python), "--grace", "1", "--unsandboxed", *credentials]
         program += [*options, *_options([("--env", catalogue.source_of(env_id)) for env_id in env_ids])]
         program += _options([("--need-tier", tier) for tier in sorted(wanted.tiers)])
         own = "" if python == sys.executable else f"-{Path(python).parents[1].name}"
-        await processes.keep_up(f"worker{own}", [*program, *_options([("--slots", wanted.slots)])])
+        program += ["--name", name := host.new_worker_name(), *_options([("--slots", wanted.slots)])]
+        await processes.keep_up(f"worker{own}", program, locks / name)
 
 
 @contextlib.asynccontextmanager
@@ -127,7 +129,8 @@ async def local_cluster(
     option, None for its default. `unjailed`: agents could read the folder; see the coordinator's `--unjailed-agents`.
     `policy_packages`: those that policies may import besides numpy. `env_timeout`, `env_memory`: the workers' options
     (seconds, MiB), None for their defaults. `workers`: workers to start at once, in parallel with the coordinator.
-    Raises ConfigError when the coordinator does not start (the folder may be in use).
+    Raises ConfigError when the coordinator does not start: another one may use the folder, or a local cluster with
+    other options.
     """
     with contextlib.ExitStack() as folders:
         root = folders.enter_context(scratch_folder(kind)) if state is None else state
@@ -144,12 +147,6 @@ async def local_cluster(
                 stale.unlink(missing_ok=True)
         ready_file.unlink(missing_ok=True)
         folders.callback(ready_file.unlink, missing_ok=True)
-        if (root / PROCESSES).exists() and not is_held(root / PROCESSES):
-            write_atomically(root / WORKERS_ENDED, b"", mode=0o600)
-        lock = ready_file.with_suffix(".lock")
-        lock_fd = _locked(lock)
-        folders.callback(os.close, lock_fd)
-        folders.callback(lock.unlink, missing_ok=True)
         packages = _options([("--policy-package", name) for name in policy_packages])
         own = {
             "--data": data and data.absolute(),
@@ -160,9 +157,20 @@ async def local_cluster(
         if unjailed and state is not None:
             coordinator += ["--unjailed-agents"]
         limits = {"--env-timeout": env_timeout, "--env-memory": env_memory}
+        shared = {
+            "--data": own["--data"],
+            "--hidden-isolation": hidden_isolation or "related",
+            "--policy-package": ", ".join(sorted(policy_packages)),
+            "env_timeout": env_timeout,
+            "env_memory": env_memory,
+            "--jail or --tier": "none" if unjailed else None,
+        }
+        given = {name: str(value) for name, value in shared.items() if value}
+        coordinator += ["--local", json.dumps(given)]
         worker_options = [*packages, *_options(limits.items())]
-        processes = _Processes(root / "logs", kind, lock_fd)
-        start = partial(_start_workers, processes, worker_options)
+        processes = _Processes(root / "logs", kind)
+        start = partial(_start_workers, processes, root / WORKERS, worker_options)
+        watching = None
         try:
             await processes.keep_up("coordinator", coordinator)
             if workers is not None:
@@ -176,22 +184,28 @@ async def local_cluster(
                 why = last_words(processes.log("coordinator")) or "no output"
                 text = f"the local coordinator did not start within {START_TIMEOUT_S:g} s: {why}"
                 raise ConfigError(text) from error
-            # Not earlier: the folder could have been another command's.
-            lock.rename(root / PROCESSES)
             kept = None if state is None else root / "open"
             if kept is not None:
                 kept.mkdir(mode=0o700, exist_ok=True)
-                await _end_permits_of_killed(kept, Path(ready.credentials["operator"]))
+                killed = partial(_end_permits_of_killed, kept, Path(ready.credentials["operator"]))
+                await killed()
+                watching = asyncio.create_task(_repeat(killed))
             joining = partial(start, ("--credentials", ready.credentials["worker"]))
             yield LocalCluster(ready, processes, joining, kept)
         finally:
+            if watching is not None:
+                watching.cancel()
+                await asyncio.gather(watching, return_exceptions=True)
             with notify_if_slow("the local cluster to end"):
                 await processes.end()
 
 
 async def _end_permits_of_killed(kept: Path, operator_file: Path) -> None:
     """Ends the permits of agents whose commands were killed: the kernel has ended these agents."""
-    watched = {path.name: path.read_text().splitlines() for path in kept.iterdir()}
+    watched: dict[str, list[str]] = {}
+    for path in kept.glob("[!.]*"):
+        with contextlib.suppress(FileNotFoundError):  # another command has ended it
+            watched[path.name] = path.read_text().splitlines()
     gone = [run for run, locks in watched.items() if not any(is_held(Path(lock)) for lock in locks)]
     if not gone:
         return
@@ -201,14 +215,33 @@ async def _end_permits_of_killed(kept: Path, operator_file: Path) -> None:
         for run in gone:
             if run in alive:
                 await operator.agent_gone(run)
-            (kept / run).unlink()
+            (kept / run).unlink(missing_ok=True)
 
 
-def _locked(new: Path) -> int:
-    new.unlink(missing_ok=True)
-    fd = os.open(new, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
-    fcntl.flock(fd, fcntl.LOCK_EX)
-    return fd
+@contextlib.contextmanager
+def _locked(path: Path | None) -> Iterator[tuple[int, ...]]:
+    """The descriptor of a lock on this file, for a process that keeps it open; nothing for None. The file has the id of
+    this command."""
+    if path is None:
+        yield ()
+        return
+    new = path.with_name(f".{path.name}")  # a coordinator never sees the file without its lock
+    fd = os.open(new, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+    try:
+        fcntl.flock(fd, fcntl.LOCK_EX)
+        os.pwrite(fd, str(os.getpid()).encode(), 0)
+        new.rename(path)
+        yield (fd,)
+    finally:
+        os.close(fd)
+
+
+async def _repeat(work: Callable[[], Awaitable[None]]) -> None:
+    """For the runs of a command that is killed while others share its cluster."""
+    while True:
+        await asyncio.sleep(_LOOK_S)
+        with contextlib.suppress(EvopolicyError):  # no coordinator serves at the moment
+            await work()
 
 
 async def unless_failed(work: asyncio.Task[T], failed: asyncio.Future[None] | None) -> T:
@@ -229,10 +262,9 @@ async def unless_failed(work: asyncio.Task[T], failed: asyncio.Future[None] | No
 class _Processes:
     """Programs that are restarted until all of them are ended."""
 
-    def __init__(self, logs: Path, kind: str, lock_fd: int) -> None:
-        """`lock_fd`: stays open in all of them, so that its lock outlives this process if they do."""
+    def __init__(self, logs: Path, kind: str) -> None:
         self.failed: asyncio.Future[None] = asyncio.get_running_loop().create_future()
-        self._logs, self._kind, self._lock_fd = logs, kind, lock_fd
+        self._logs, self._kind = logs, kind
         self._running: list[ChildProcess] = []
         self._restarting: list[asyncio.Task[None]] = []
 
@@ -240,9 +272,10 @@ class _Processes:
         """The log file of that process."""
         return self._logs / f"{self._kind}-{name}.log"
 
-    async def keep_up(self, name: str, program: Sequence[str]) -> None:
-        child = await self._start(name, program)
-        restarting = asyncio.create_task(self._keep_up(child, name, program))
+    async def keep_up(self, name: str, program: Sequence[str], lock: Path | None = None) -> None:
+        """`lock`: a file that each of these processes holds locked until its end."""
+        child = await self._start(name, program, lock)
+        restarting = asyncio.create_task(self._keep_up(child, name, program, lock))
         restarting.add_done_callback(self._given_up)
         self._restarting.append(restarting)
 
@@ -255,7 +288,9 @@ class _Processes:
         for child in reversed(self._running):
             await child.end(END_GRACE_S)
 
-    async def _keep_up(self, child: ChildProcess, name: str, program: Sequence[str]) -> None:
+    async def _keep_up(
+        self, child: ChildProcess, name: str, program: Sequence[str], lock: Path | None
+    ) -> None:
         deaths, began = 0, time.monotonic()
         while True:
             code = await child.ended()
@@ -270,10 +305,11 @@ class _Processes:
                 raise ConfigError(f"{name} keeps ending: {reason}")
             await asyncio.sleep(min(_LONGEST_PAUSE_S, _RESTART_PAUSE_S * 2 ** (deaths - 1)))
             began = time.monotonic()
-            child = await self._start(name, program)
+            child = await self._start(name, program, lock)
 
-    async def _start(self, name: str, program: Sequence[str]) -> ChildProcess:
-        child = await ChildProcess.start(program, self.log(name), keeps=(self._lock_fd,))
+    async def _start(self, name: str, program: Sequence[str], lock: Path | None) -> ChildProcess:
+        with _locked(lock) as keeps:
+            child = await ChildProcess.start(program, self.log(name), keeps=keeps)
         self._running.append(child)
         return child
 

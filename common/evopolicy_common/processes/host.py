@@ -6,6 +6,8 @@ Namespaces and containers share their kernel's counters, so the unit is the kern
 from __future__ import annotations
 
 import platform
+import secrets
+import socket
 import subprocess
 from pathlib import Path
 
@@ -13,6 +15,11 @@ _BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
 
 NO_BOOT_ID = f"the kernel does not tell its boot id: mount /proc so that {_BOOT_ID} can be read"
 """Why a worker plays no hidden episodes, and why an agent counts as being on every kernel."""
+
+
+def new_worker_name() -> str:
+    """The host's name with a random suffix."""
+    return f"{socket.gethostname().split('.')[0][:40] or 'worker'}-{secrets.token_hex(3)}"
 
 
 def boot_id() -> str:

@@ -13,6 +13,7 @@ Rule: tokens and results cross a network inside TLS only, unless the file states
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import ipaddress
 import os
 import re
@@ -24,6 +25,7 @@ import msgspec
 
 from evopolicy_common.errors import DECODE_ERRORS, ConfigError
 from evopolicy_common.records.blobs import digest_of, write_atomically
+from evopolicy_common.records.open_run import is_held
 from evopolicy_common.regular_files import read_given
 
 Role = Literal["worker", "gateway", "operator"]
@@ -70,6 +72,8 @@ _MOST_BYTES = 1 << 20
 _LOOK_S = 0.02
 SWEEP_STATE = ".cluster"
 """The state folder of `evopolicy suite --local`, in the sweep's folder."""
+WORKERS = "workers"
+"""Folder in a state folder: each worker of a local command holds the lock of its name there until it has ended."""
 
 
 def write(credentials: Credentials, path: Path) -> None:
@@ -192,6 +196,22 @@ def find(role: Role, connect: tuple[str, ...] = (), file: Path | None = None) ->
     if own.role != role:
         raise ConfigError(f"{file} holds credentials of role {own.role!r}; this command needs {role!r}")
     return at(own, connect)
+
+
+def find_running(connect: tuple[str, ...] = (), file: Path | None = None) -> Credentials:
+    """As `find` for an operator. With neither argument, and no coordinator on the default state folder, those of the
+    local cluster that a command of this user runs. ConfigError names them if there are several."""
+    if not connect and file is None and not is_held(default_state_dir() / "lock"):
+        folders: set[Path] = set()
+        for entry in (state_home() / "clusters").glob("[!.]*"):
+            with contextlib.suppress(OSError):  # its cluster has ended
+                folder = Path(entry.read_text())
+                folders |= {folder} if is_held(folder.parent / "lock") else set()
+        if len(folders) > 1:
+            several = " or ".join(f"--credentials {folder}" for folder in sorted(folders))
+            raise ConfigError(f"{len(folders)} clusters run on this machine: name one with {several}")
+        file = next(iter(folders), None)
+    return find("operator", connect, file)
 
 
 def _read_private(path: Path) -> bytes:

@@ -147,6 +147,14 @@ def serve(
             " runs new cases.",
         ),
     ] = False,
+    local: Annotated[
+        str | None,
+        typer.Option(
+            hidden=True,
+            help="Options that the commands of a local cluster share, as JSON. While a coordinator with the same ones"
+            " serves from this state folder, this one waits to take its place.",
+        ),
+    ] = None,
     trust_workers: Annotated[
         bool,
         typer.Option(
@@ -174,6 +182,7 @@ def serve(
         allowed_packages=checked_names(policy_package),
         unjailed=unjailed_agents,
         trust_workers=trust_workers,
+        local=None if local is None else msgspec.json.decode(local, type=dict[str, str]),
         core=CoreSettings(
             hidden_isolation=hidden_isolation,
             hidden_wait_s=hidden_wait,

@@ -37,7 +37,7 @@ def asking(connect: list[str] | None, file: Path | None, work: Callable[[Operato
     """`work` with a link to the coordinator."""
 
     async def ask() -> T:
-        async with transport.connect(credentials.find("operator", tuple(connect or ()), file)) as link:
+        async with transport.connect(credentials.find_running(tuple(connect or ()), file)) as link:
             return await work(OperatorClient(link))
 
     return asyncio.run(ask())

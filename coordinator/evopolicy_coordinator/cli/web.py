@@ -147,7 +147,7 @@ async def _is_reachable(own: Credentials) -> bool:
 def _credentials(connect: tuple[str, ...], file: Path | None) -> Credentials | None:
     """The operator's; None where none were named and this machine has none."""
     try:
-        return credentials.find("operator", connect, file)
+        return credentials.find_running(connect, file)
     except ConfigError:
         if connect or file:
             raise

@@ -18,9 +18,7 @@ import msgspec
 
 from evopolicy_common import catalogue
 from evopolicy_common.errors import ConfigError, DamagedStoreError, LeadLostError, StorageError
-from evopolicy_common.local.cluster import PROCESSES, WORKERS_ENDED
 from evopolicy_common.logs import structlog
-from evopolicy_common.processes import host
 from evopolicy_common.records.blobs import BlobStore
 from evopolicy_common.simulators import SIMULATORS
 from evopolicy_common.wire import credentials, transport
@@ -38,12 +36,20 @@ from evopolicy_coordinator.server.uploads import Uploads
 from evopolicy_coordinator.splits import SplitSource, load_or_create_secret, secret_of
 from evopolicy_coordinator.storage.engines import Place, checked_address, chosen_place, record_place
 from evopolicy_coordinator.storage.sealing import APPROVED, SharedFiles
-from evopolicy_coordinator.storage.state_folder import ROLES, StateFolder, held, reachable, resolve_listen
+from evopolicy_coordinator.storage.state_folder import (
+    ROLES,
+    InUseError,
+    StateFolder,
+    held,
+    reachable,
+    resolve_listen,
+)
 from evopolicy_coordinator.storage.store import Store
 from evopolicy_coordinator.worlds import JOURNAL
 
 log: structlog.stdlib.BoundLogger = structlog.get_logger()
 
+_JOINED = "another command's local cluster runs on this state folder: both share it and the slots of both"
 _PAUSE_S = 0.1
 """Between attempts to lead, seconds."""
 
@@ -70,6 +76,8 @@ class Options(msgspec.Struct, frozen=True, kw_only=True):
     `splits.secret_of`."""
     trust_workers: bool = False
     """Accept any environment definition that workers announce."""
+    local: dict[str, str] | None = None
+    """For a local cluster's coordinator: see `state_folder.Holder`."""
     core: CoreSettings = CoreSettings()
     metrics: str | None = None
     """HOST:PORT of `/metrics` and `/healthz`; None: not served."""
@@ -92,7 +100,10 @@ async def run(options: Options, stop: asyncio.Event, on_ready: Callable[[Ready],
         raise ConfigError(
             "--seal-key: a store in the state folder is not shared; name a database with --store"
         )
-    with contextlib.closing(StateFolder.open(options.state, options.cluster)) as state:
+    opened = await _opened(options, stop, on_ready)
+    if opened is None:
+        return
+    with contextlib.closing(opened) as state:
         machines = Machines(state.root)
         listen = _listen(state, options, machines)
         while not stop.is_set():
@@ -109,6 +120,25 @@ async def run(options: Options, stop: asyncio.Event, on_ready: Callable[[Ready],
                     log.warning("standby: waiting to lead", why=why)
             await _pause(stop)
     log.info("stopped; everything is on disk", state=str(state.root))
+
+
+async def _opened(
+    options: Options, stop: asyncio.Event, on_ready: Callable[[Ready], None]
+) -> StateFolder | None:
+    """The state folder, None at `stop`. While another command's coordinator of the same local cluster has it, this one
+    names that one as ready, and waits to take its place."""
+    known = False
+    while not stop.is_set():
+        try:
+            return StateFolder.open(options.state, options.cluster, options.local)
+        except InUseError as error:
+            ready = error.shared(options.local)
+            if ready is not None and not known:
+                known = True
+                note = "; ".join(filter(None, (_JOINED, ready.note)))
+                on_ready(msgspec.structs.replace(ready, note=note))
+        await _pause(stop)
+    return None
 
 
 async def _pause(stop: asyncio.Event) -> None:
@@ -146,13 +176,12 @@ async def _lead(
             state.root / SIGNING_KEY
         )  # now, so that every backup has it: runs are named from it
         record_place(state.root, place)
-        (state.root / PROCESSES).unlink(missing_ok=True)
-        ended = state.root / WORKERS_ENDED
-        if ended.exists():
-            # Otherwise the first agent would wait for `silent_bar_s`, as a worker of the last command might still
-            # play.
-            store.forget_kernels(host.boot_id())
-            ended.unlink()
+        # Otherwise agents would wait for `silent_bar_s`, as a worker of an earlier command might still play.
+        ended = [] if options.local is None else await asyncio.to_thread(state.ended_workers)
+        if ended:
+            store.forget_kernels(ended)
+        for name in ended:
+            (state.root / credentials.WORKERS / name).unlink()
         blobs = BlobStore(state.root / "blobs")
         blobs.drop_unfinished()
         uploads = Uploads()
@@ -195,15 +224,15 @@ async def _lead(
         declare_all(server, cluster, liveliness)
         credentials.publish(endpoints, state.credentials)
         opened.callback(credentials.withdraw, endpoints)
-        on_ready(
-            Ready(
-                cluster=cluster,
-                endpoints=(*endpoints, *reachable(remote)),
-                credentials={role: str(path) for role, path in files.items()},
-                state=str(state.root),
-                note=note,
-            )
+        ready = Ready(
+            cluster=cluster,
+            endpoints=(*endpoints, *reachable(remote)),
+            credentials={role: str(path) for role, path in files.items()},
+            state=str(state.root),
+            note=note,
         )
+        state.serving(ready)
+        on_ready(ready)
         try:
             await _until(stop, service)
         except LeadLostError:

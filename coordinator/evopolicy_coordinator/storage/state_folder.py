@@ -12,6 +12,7 @@
       sealed                      what of this folder that database has too, for standbys: see sealing.py
       blobs/                      trajectories, videos and policy bundles
       coordinator.sock            the socket for processes of this machine
+      workers/<name>              locks of local commands' workers, which the kernel frees with the worker
 
 All passwords, tokens and keys are made once, have mode 0600, and survive restarts, so that workers reconnect by
 themselves.
@@ -26,7 +27,8 @@ import os
 import secrets
 import socket
 import stat
-from collections.abc import Iterator
+import time
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import msgspec
@@ -34,13 +36,22 @@ import msgspec
 from evopolicy_common.errors import DECODE_ERRORS, ConfigError
 from evopolicy_common.processes.preflight import check_writable, refused
 from evopolicy_common.records.blobs import write_atomically
+from evopolicy_common.records.open_run import is_held
 from evopolicy_common.wire import credentials, keys
-from evopolicy_common.wire.credentials import Credentials, Role
+from evopolicy_common.wire.credentials import WORKERS, Credentials, Ready, Role
 
 ROLES: tuple[Role, ...] = ("worker", "gateway", "operator")
 _SOCKET = "coordinator.sock"
 _SOCKET_PATH_LIMIT = 100
 """Bytes. Linux allows 107 for a unix socket's path, and Zenoh puts a `.lock` beside it."""
+_ANOTHER = (
+    "choose another folder with --state; without --data, another state has other hidden cases, so its scores are not"
+    " comparable"
+)
+_MOST_BYTES = 1 << 20
+_WRITTEN_S, _LOOK_S = 0.5, 0.02
+"""Within this time a process that has taken the lock has said so in the file."""
+_ENDED_S = 3.0
 
 
 class Identity(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -53,29 +64,69 @@ class Identity(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     operator_token: str
 
 
+class Holder(msgspec.Struct, frozen=True, kw_only=True):
+    """Content of the lock file while a coordinator has the folder."""
+
+    process: int
+    local: dict[str, str] | None = None
+    """The options of a local cluster that its commands have to share, by name; None: another coordinator."""
+    ready: Ready | None = None
+    """None: it does not serve yet."""
+
+
+class InUseError(ConfigError):
+    """A process has the folder."""
+
+    def __init__(self, root: Path, holder: Holder | None) -> None:
+        super().__init__(
+            f"state folder {root} is in use by another coordinator (process"
+            f" {'unknown' if holder is None else holder.process}); wait for it, stop it, or {_ANOTHER}"
+        )
+        self.root, self.holder = root, holder
+
+    def shared(self, local: Mapping[str, str] | None) -> Ready | None:
+        """How a local cluster with these options reaches the coordinator that serves here; None: it is starting. Raises
+        ConfigError when it is none of a local cluster, or has other options."""
+        holder = self.holder
+        if local is None or holder is None or holder.local is None:
+            raise self
+        names = sorted(name for name in {*local, *holder.local} if local.get(name) != holder.local.get(name))
+        if names:
+            given = "; ".join(
+                f"{name}: {holder.local.get(name, 'not given')} there, {local.get(name, 'not given')} here"
+                for name in names
+            )
+            raise ConfigError(
+                f"the local cluster that runs on state folder {self.root} has other options ({given}): give the"
+                f" same, wait until its commands have ended, or {_ANOTHER}"
+            )
+        return holder.ready
+
+
 class StateFolder:
     """An opened state folder, locked until `close`."""
 
-    def __init__(self, root: Path, lock_fd: int, identity: Identity) -> None:
+    def __init__(self, root: Path, lock_fd: int, holder: Holder, identity: Identity) -> None:
         self.root = root
         self.identity = identity
         self.passwords = root / "passwords"
         """The file that Zenoh's router reads: a line `user:password` for each role."""
         self.credentials = root / "credentials"
         """Folder of this machine's credentials, one file per role."""
-        self._lock_fd = lock_fd
+        self._lock_fd, self._holder = lock_fd, holder
         self._link: Path | None = None
 
     @classmethod
-    def open(cls, root: Path, cluster: str | None = None) -> StateFolder:
+    def open(cls, root: Path, cluster: str | None = None, local: dict[str, str] | None = None) -> StateFolder:
         """Creates the folder if it is missing, locks it and reads its identity. `cluster` None: the folder's
-        own name, `local` for a new one. Raises ConfigError when another coordinator holds the lock, others
-        may enter the folder, or it belongs to another cluster."""
+        own name, `local` for a new one. `local`: as in `Holder`. Raises InUseError when another coordinator holds the
+        lock, ConfigError when others may enter the folder, or it belongs to another cluster."""
         root = Path(os.path.abspath(root))
         _make_private(root, cluster)
-        lock_fd = lock(root)
+        holder = Holder(process=os.getpid(), local=local)
+        lock_fd = lock(root, holder)
         try:
-            return cls(root, lock_fd, _identity(root, cluster))
+            return cls(root, lock_fd, holder, _identity(root, cluster))
         except BaseException:
             os.close(lock_fd)
             raise
@@ -117,12 +168,29 @@ class StateFolder:
         lines = [f"{role}:{self.identity.passwords[role]}\n" for role in ROLES]
         write_atomically(self.passwords, "".join(lines).encode(), mode=0o600)
 
+    def serving(self, ready: Ready) -> None:
+        """Tells the coordinators of further local commands how to reach this one."""
+        _write(self._lock_fd, msgspec.structs.replace(self._holder, ready=ready))
+
+    def ended_workers(self) -> list[str]:
+        """Names of the local workers that have ended: the kernel has freed their locks. Waits a few seconds for those
+        whose command was killed, as they are ending."""
+        late = time.monotonic() + _ENDED_S
+        while True:
+            locks = list((self.root / WORKERS).glob("[!.]*"))
+            held = [lock for lock in locks if is_held(lock)]
+            commands = [Path("/proc", lock.read_text()) for lock in held]
+            if time.monotonic() > late or all(each.exists() for each in commands):
+                return [lock.name for lock in locks if lock not in held]
+            time.sleep(_LOOK_S)
+
     def close(self) -> None:
         """Releases the folder for another coordinator."""
         if self._link is not None:
             with contextlib.suppress(OSError):
                 self._link.unlink()
                 self._link.parent.rmdir()  # if it was the last
+        os.ftruncate(self._lock_fd, 0)
         os.close(self._lock_fd)
 
 
@@ -159,22 +227,30 @@ def _make_private(root: Path, cluster: str | None) -> None:
         )
 
 
-def lock(root: Path) -> int:
-    """Locks the folder until the returned file descriptor is closed. Raises ConfigError when it is in use."""
+def lock(root: Path, holder: Holder | None = None) -> int:
+    """Locks the folder until the returned file descriptor is closed. Raises InUseError when it is in use."""
     fd = os.open(root / "lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
-    try:
-        fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError as error:
-        holder = os.pread(fd, 32, 0).decode("ascii", "replace").strip()
-        os.close(fd)
-        raise ConfigError(
-            f"state folder {root} is in use by another coordinator (process {holder or 'unknown'});"
-            " wait for it, stop it, or choose another folder with --state;"
-            " without --data, another state has other hidden cases, so its scores are not comparable"
-        ) from error
-    os.ftruncate(fd, 0)
-    os.pwrite(fd, f"{os.getpid()}\n".encode(), 0)
-    return fd
+    late = time.monotonic() + _WRITTEN_S
+    while True:
+        try:
+            fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            other = None
+            with contextlib.suppress(*DECODE_ERRORS):
+                other = msgspec.json.decode(os.pread(fd, _MOST_BYTES, 0), type=Holder)
+            if other is not None or time.monotonic() > late:
+                os.close(fd)
+                raise InUseError(root, other) from error
+            time.sleep(_LOOK_S)
+        else:
+            _write(fd, holder or Holder(process=os.getpid()))
+            return fd
+
+
+def _write(fd: int, holder: Holder) -> None:
+    with contextlib.suppress(OSError):  # on a full disk no further command can join
+        os.ftruncate(fd, 0)
+        os.pwrite(fd, msgspec.json.encode(holder) + b"\n", 0)
 
 
 def _identity(root: Path, cluster: str | None) -> Identity:

@@ -177,12 +177,11 @@ class Store:
         """Lets the operation of another thread fail."""
         self._db.abort()
 
-    def forget_kernels(self, boot_id: str) -> None:
-        """Durably deletes the records of which workers were on that kernel: those workers are known to have ended."""
+    def forget_kernels(self, workers: Iterable[str]) -> None:
+        """Durably deletes the records of the kernels on which these workers were: they are known to have ended."""
         with self._transaction():
-            for row in list(rows(self._db, records.KernelRow)):
-                if row.boot_id == boot_id:
-                    self._db.execute("DELETE FROM kernels WHERE worker = ?", (row.worker,))
+            for worker in workers:
+                self._db.execute("DELETE FROM kernels WHERE worker = ?", (worker,))
 
     def write_claim(self, suite: str, name: str, data: bytes) -> None:
         """Stores a sweep's claim durably. Raises StorageError when it fails."""

@@ -10,7 +10,6 @@ import pytest
 from commands import SMALL, STILL, agent, command, ended, record_in, run_dir
 from waiting import wait_until
 
-from evopolicy_common.local.cluster import WORKERS_ENDED
 from evopolicy_common.messages.environment import Split
 from evopolicy_common.records.splits import SPLITS, cases_hash
 from evopolicy_coordinator.core.contract.records import KernelRow
@@ -112,23 +111,15 @@ def known_hash(secret: bytes, split: Split, hashes: dict[str, str]) -> str:
     return f"sha256:{cases_hash(derive(secret, 'toy', 'toy/line', counts)[split])}"
 
 
-def test_a_second_command_beside_the_first_is_told_what_to_do(tmp_path: Path) -> None:
-    state = tmp_path / "xdg" / "evopolicy" / "local"
+def test_no_run_waits_for_a_killed_one_or_its_workers(tmp_path: Path) -> None:
     waits = agent(tmp_path, "submit([0])\nopen('here', 'w')\ntime.sleep(1000)")
     words = ["local", "--env", "toy/line", "--agent", waits, "--entry", "waits", "--exp-id", "t", *SMALL]
     with command(tmp_path, *words) as running:
         wait_until(lambda: [*(tmp_path / "runs").glob("*/*/t/workspace/here")])
-        _, err = ended(tmp_path, "try", STILL, "--env", "toy/line", "--cases", "0", ends=2)
-        assert "another folder with --state" in err
-        assert not (state / WORKERS_ENDED).exists()
-        words = ["try", STILL, "--env", "toy/line", "--cases", "0", "--fresh"]
-        out, _ = ended(tmp_path, *words)
-        assert "the next call has others under the same ids" in out
         running.kill()
-    # The killed run keeps nobody from the state, and no later run waits for its agent or its workers.
-    assert len(kernels(state)) == 1
+    assert len(kernels(tmp_path / "xdg" / "evopolicy" / "local")) == 1
     played(tmp_path, "after")
-    assert len(kernels(state)) == 1
+    assert len(kernels(tmp_path / "xdg" / "evopolicy" / "local")) == 1
 
 
 def test_state_and_fresh_do_not_go_together(tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import json
 import os
 import signal
 import sys
@@ -122,43 +123,28 @@ async def test_what_a_killed_command_left_in_the_state_folder_is_removed(
     assert list(tmp_path.glob("*.json")) == [others]
 
 
-def test_workers_count_as_ended_once_no_process_of_the_last_command_lives(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    ended, lock = tmp_path / local_cluster.WORKERS_ENDED, tmp_path / local_cluster.PROCESSES
-
-    def says_so() -> bool:
-        async def main() -> bool:
-            async with local_cluster.local_cluster("test", state=tmp_path) as cluster:
-                await cluster.start_workers(["toy/line"], slots=1)
-                assert open_run.is_held(lock)
-                return ended.exists()
-
-        return asyncio.run(main())
-
-    programs(monkeypatch, "import sys; print('error: in use', file=sys.stderr); sys.exit(2)")
-    assert bring_up(tmp_path) == "in use"
-    assert not lock.exists()  # the folder may be that of a living command
+def test_a_worker_holds_its_lock_until_its_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     programs(monkeypatch, SERVES)
-    assert not says_so()
-    assert says_so()
-    ended.unlink()
-    held = local_cluster._locked(lock)  # as a worker does that outlives its command
-    assert not says_so()
-    os.close(held)
+    workers = tmp_path / "workers"
+
+    async def main() -> None:
+        async with local_cluster.local_cluster("test", state=tmp_path) as cluster:
+            await cluster.start_workers(["toy/line"], slots=1)
+            (lock,) = workers.iterdir()
+            assert lock.read_text() == str(os.getpid())
+            processes, *_ = cluster._start_workers.args
+            holders = [child for child in processes._running if lock in open_files(child.pid)]
+            assert [child.log.stem for child in holders] == ["test-worker"]
+            assert lock not in open_files(os.getpid())
+            assert open_run.is_held(lock)
+
+    asyncio.run(main())
+    (lock,) = workers.iterdir()
+    assert not open_run.is_held(lock)
 
 
-async def test_a_worker_keeps_the_lock_of_its_command(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    programs(monkeypatch, SERVES)
-
-    async with local_cluster.local_cluster("test", state=tmp_path) as cluster:
-        await cluster.start_workers(["toy/line"], slots=1)
-        processes, *_ = cluster._start_workers.args
-        for child in processes._running:
-            held = [fd.resolve() for fd in Path(f"/proc/{child.pid}/fd").iterdir()]
-            assert tmp_path / local_cluster.PROCESSES in held, child.log
+def open_files(pid: int) -> list[Path]:
+    return [fd.resolve() for fd in Path(f"/proc/{pid}/fd").iterdir()]
 
 
 NO_MODULE = "worker does not start: ModuleNotFoundError: No module named 'no_such_module'; see "
@@ -205,11 +191,20 @@ async def test_a_local_cluster_passes_its_options_on(tmp_path: Path, monkeypatch
     more = {"env_timeout": 2.5, "env_memory": 512}
     given = {"data": Path("d"), "policy_packages": ["scipy"], **more}
     await started(None, ["toy/line", "toy/maze"], 5, **given)
-    expected = f"--trust-workers --data {tmp_path}/d --policy-package scipy"
-    assert " ".join(noted_by["test-coordinator"]).endswith(expected)
+    expected = f"--trust-workers --data {tmp_path}/d --policy-package scipy --local"
+    *words, shared = noted_by["test-coordinator"]
+    assert " ".join(words).endswith(expected)
+    assert json.loads(shared) == {
+        "--data": f"{tmp_path}/d",
+        "--hidden-isolation": "related",
+        "--policy-package": "scipy",
+        "env_timeout": "2.5",
+        "env_memory": "512",
+    }
     own = " ".join(noted_by["test-worker"])
     assert "--policy-package scipy --env-timeout 2.5 --env-memory 512" in own
-    assert own.endswith("--env toy/line --env toy/maze --slots 5")
+    assert "--env toy/line --env toy/maze --name " in own
+    assert own.endswith(" --slots 5")
 
 
 async def test_each_virtual_environments_worker_has_all_slots(
@@ -222,8 +217,11 @@ async def test_each_virtual_environments_worker_has_all_slots(
     divided = {sys.executable: ["toy/line"], str(other): ["toy/maze"]}
     monkeypatch.setattr(local_cluster.installs, "divided", lambda env_ids: divided)
     await started(tmp_path, ["toy/line", "toy/maze"], 2)
-    assert noted_by["test-worker"][-4:] == ["--env", "toy/line", "--slots", "2"]
-    assert noted_by["test-worker-toys"][-4:] == ["--env", "toy/maze", "--slots", "2"]
+    plain, toys = noted_by["test-worker"], noted_by["test-worker-toys"]
+    assert plain[-6:-3] == ["--env", "toy/line", "--name"]
+    assert toys[-6:-3] == ["--env", "toy/maze", "--name"]
+    assert plain[-3] != toys[-3]
+    assert plain[-2:] == toys[-2:] == ["--slots", "2"]
 
 
 async def test_workers_are_started_beside_the_coordinator(
@@ -236,7 +234,7 @@ async def test_workers_are_started_beside_the_coordinator(
     coordinator, worker = noted_by["test-coordinator"], noted_by["test-worker"]
     place = coordinator[coordinator.index("--ready-file") + 1]
     assert worker[worker.index("--ready-file") + 1] == place
-    assert worker[-6:] == ["--env", "toy/line", "--need-tier", "bwrap", "--slots", "2"]
+    assert worker[-8:-3] == ["--env", "toy/line", "--need-tier", "bwrap", "--name"]
 
 
 def test_a_childs_error_is_told_although_another_process_wrote_later(tmp_path: Path) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import fcntl
 from pathlib import Path
 
 import msgspec
@@ -60,6 +62,37 @@ def test_without_an_endpoint_the_default_state_folder_is_looked_at() -> None:
     path = credentials.default_state_dir() / "credentials" / "worker.json"
     credentials.write(worker(), path)
     assert credentials.find("worker") == worker()
+
+
+def test_an_operator_finds_the_local_cluster_that_runs(tmp_path: Path) -> None:
+    def published(name: str) -> Path:
+        folder = tmp_path / name / "credentials"
+        endpoint = f"unixsock-stream/{tmp_path / name}/coordinator.sock"
+        own = msgspec.structs.replace(worker(endpoint), role="operator", cluster=name)
+        credentials.write(own, folder / "operator.json")
+        credentials.publish((endpoint,), folder)
+        return folder
+
+    def held(state: Path) -> contextlib.ExitStack:
+        stack = contextlib.ExitStack()
+        fcntl.flock(stack.enter_context((state / "lock").open("w")), fcntl.LOCK_EX)
+        return stack
+
+    first, second = published("first"), published("second")  # two that were killed
+    with pytest.raises(ConfigError, match="no operator credentials"):
+        credentials.find_running()
+    with held(first.parent):
+        assert credentials.find_running().cluster == "first"
+        assert credentials.find_running(file=second).cluster == "second"
+        with held(second.parent):
+            with pytest.raises(ConfigError, match="2 clusters run on this machine") as refused:
+                credentials.find_running()
+            assert f"--credentials {first} or --credentials {second}" in str(refused.value)
+            own = msgspec.structs.replace(worker(), role="operator", cluster="usual")
+            usual = credentials.default_state_dir()
+            credentials.write(own, usual / "credentials/operator.json")
+            with held(usual):
+                assert credentials.find_running().cluster == "usual"
 
 
 @pytest.mark.parametrize(

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
+import subprocess
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -11,7 +13,8 @@ import pytest
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.processes.scratch import scratch_folder
 from evopolicy_common.wire import credentials
-from evopolicy_coordinator.storage.state_folder import StateFolder, reachable, resolve_listen
+from evopolicy_common.wire.credentials import Ready
+from evopolicy_coordinator.storage.state_folder import InUseError, StateFolder, reachable, resolve_listen
 
 
 @pytest.fixture
@@ -55,8 +58,62 @@ def test_second_coordinator_on_one_folder_is_refused_and_told_by_whom(tmp_path: 
     ) as refused:
         StateFolder.open(tmp_path)
     assert "another state has other hidden cases" in str(refused.value)
+    with pytest.raises(InUseError):  # it is not a local cluster's
+        refused_by(tmp_path).shared({})
     state.close()
     StateFolder.open(tmp_path).close()
+
+
+def refused_by(root: Path) -> InUseError:
+    with pytest.raises(InUseError) as refused:
+        StateFolder.open(root)
+    return refused.value
+
+
+def test_a_local_cluster_is_shared_by_commands_with_its_options_alone(tmp_path: Path) -> None:
+    options = {"--data": "/cases", "--hidden-isolation": "related"}
+    state = StateFolder.open(tmp_path, local=options)
+    assert refused_by(tmp_path).shared(options) is None  # it is starting
+    ready = Ready(cluster="local", endpoints=("tcp/127.0.0.1:7447",), credentials={}, state=str(tmp_path))
+    state.serving(ready)
+    assert refused_by(tmp_path).shared(dict(options)) == ready
+    others = {"--hidden-isolation": "off", "env_timeout": "5"}
+    with pytest.raises(ConfigError) as refused:
+        refused_by(tmp_path).shared(others)
+    assert (
+        "(--data: /cases there, not given here; --hidden-isolation: related there, off here;"
+        " env_timeout: not given there, 5 here)"
+    ) in str(refused.value)
+    assert "another folder with --state" in str(refused.value)
+    with pytest.raises(InUseError):  # a coordinator of its own
+        refused_by(tmp_path).shared(None)
+    state.close()
+    assert (tmp_path / "lock").read_text() == ""
+
+
+def test_a_lock_without_a_word_is_in_use(tmp_path: Path) -> None:
+    with (tmp_path / "lock").open("w") as held:
+        fcntl.flock(held, fcntl.LOCK_EX)
+        with pytest.raises(InUseError, match="process unknown"):
+            refused_by(tmp_path).shared({})
+
+
+def test_a_worker_has_ended_when_the_kernel_has_freed_its_lock(tmp_path: Path) -> None:
+    """The attack: an agent without a jail ends its command and stops the command's worker, which then keeps a hidden
+    episode. The next coordinator waits for that worker, and must not take it for one that has ended."""
+    gone = subprocess.Popen(["true"])
+    gone.wait()
+    commands = {"plays": os.getpid(), "stopped": gone.pid, "ended": os.getpid(), "ended-too": gone.pid}
+    (tmp_path / "workers").mkdir()
+    for name, command in commands.items():
+        (tmp_path / "workers" / name).write_text(str(command))
+    state = StateFolder.open(tmp_path, local={})
+    with (tmp_path / "workers/plays").open() as plays, (tmp_path / "workers/stopped").open() as stopped:
+        for each in (plays, stopped):
+            fcntl.flock(each, fcntl.LOCK_EX)
+        assert sorted(state.ended_workers()) == ["ended", "ended-too"]
+    assert sorted(state.ended_workers()) == sorted(commands)
+    state.close()
 
 
 def test_folder_that_others_may_enter_is_refused(tmp_path: Path) -> None:
