@@ -8,6 +8,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -23,8 +24,9 @@ from evopolicy_common.regular_files import read_given
 from evopolicy_common.terminal import counted, say, say_json, say_lines
 from evopolicy_results.reading.comparability import REMEDIES, MixedRunsError
 from evopolicy_results.reading.parallel import Processes
-from evopolicy_results.reading.reader import load_runs, rescored
-from evopolicy_results.scoring.scores import read_score_csv
+from evopolicy_results.reading.reader import find_run_dirs, load_runs, rescored
+from evopolicy_results.reading.records import LeftOut
+from evopolicy_results.scoring.scores import ScoreTable, read_score_csv
 from evopolicy_results.studies.study import Study, study_of
 
 if TYPE_CHECKING:
@@ -68,17 +70,22 @@ def report(
     """Write a report on finished runs: leaderboard, figures and diagnostics."""
     try:
         check_writable(out, "--out")
-        with Processes(
-            os.cpu_count() or 1, "evopolicy_results.report", "evopolicy_results.figures.style"
-        ) as processes:
-            # Here, not above: it needs jinja2, and `evopolicy` loads this module to list its commands.
-            from evopolicy_results.report import write_report
+        tables = [path for path in runs if path.suffix == ".csv" and path.is_file()]
+        table = _score_table(tables)
+        folders, without = find_run_dirs(path for path in runs if path not in tables)
+        written_by = "evopolicy_results.report"
+        # Without a run there is nothing to do for them.
+        jobs = (os.cpu_count() or 1) if folders else 1
+        with Processes(jobs, written_by, "evopolicy_results.figures.style") as processes, _progress() as tell:
+            if folders or table is not None:
+                import_module(written_by)  # while the children do
+            study = _study(folders, without, table, scores, allow_mixed, processes, tell)
+            index = None
+            if study.suites:
+                # Here, not above: it needs jinja2, and `evopolicy` loads this module to list its commands.
+                from evopolicy_results.report import write_report
 
-            with _progress() as tell:
-                study = _study(runs, scores, allow_mixed, processes, tell)
-                index = None
-                if study.suites:
-                    index = write_report(study, out, processes=processes, progress=tell)
+                index = write_report(study, out, processes=processes, progress=tell)
     except MixedRunsError as error:
         kinds = [one.what for one in error.mixtures]
         same = dict.fromkeys(REMEDIES[kind] for kind in kinds if kind in REMEDIES)
@@ -104,35 +111,37 @@ def report(
         )
 
 
+def _score_table(paths: list[Path]) -> ScoreTable | None:
+    if len(paths) > 1:
+        raise ConfigError(f"one CSV of held-out returns at most, not {len(paths)}")
+    for path in paths:
+        try:
+            return read_score_csv(read_given(path, str(path)).decode(), source=str(path))
+        except UnicodeDecodeError as error:
+            raise ConfigError(f"{path} cannot be read: {error}") from error
+    return None
+
+
 def _study(
-    paths: list[Path],
+    folders: list[Path],
+    left_out: list[LeftOut],
+    scores: ScoreTable | None,
     rescore: str | None,
     allow_mixed: bool,
     processes: Processes,
     tell: Tell,
 ) -> Study:
-    tables = [path for path in paths if path.suffix == ".csv" and path.is_file()]
-    if len(tables) > 1:
-        raise ConfigError(f"one CSV of held-out returns at most, not {len(tables)}")
     if rescore and not is_name(rescore):
         raise ConfigError(
             f"--scores {rescore!r} cannot be the name of a re-score: use letters, digits, '.', '_' and '-'"
         )
     loaded = load_runs(
-        [path for path in paths if path not in tables],
-        processes=processes,
-        progress=lambda done, total: tell("runs read", done, total),
+        folders, processes=processes, progress=lambda done, total: tell("runs read", done, total)
     )
-    scores = None
-    for table in tables:
-        try:
-            scores = read_score_csv(read_given(table, str(table)).decode(), source=str(table))
-        except UnicodeDecodeError as error:
-            raise ConfigError(f"{table} cannot be read: {error}") from error
     tell("statistics", 0, 1)
     study = study_of(
         rescored(loaded.runs, rescore) if rescore else loaded.runs,
-        left_out=loaded.left_out,
+        left_out=(*left_out, *loaded.left_out),
         allow_mixed=allow_mixed,
         scores=scores,
     )
