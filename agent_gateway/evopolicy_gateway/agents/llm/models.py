@@ -9,8 +9,9 @@ from __future__ import annotations
 import contextlib
 import json
 import re
+import ssl
 from collections.abc import Awaitable, Callable
-from functools import partial
+from functools import cache, partial
 from typing import Any
 
 import httpx2
@@ -35,10 +36,20 @@ def opened(
     """The model, the settings of each request, and a function that asks the server for the names of its models.
     `settings`: made by `harnesses/coding_agents/llm.py`."""
     http = httpx2.AsyncClient(
-        timeout=settings["timeout_s"], trust_env=False, event_hooks={"response": [_mended]}
+        timeout=settings["timeout_s"],
+        trust_env=False,
+        verify=_trusted(),
+        event_hooks={"response": [_mended]},
     )
     opens = {"messages": _messages, "gemini": _gemini}.get(settings["api"], _openai)
     return (*opens(settings, key or "none", http), partial(_listed, settings, key, http))
+
+
+@cache
+def _trusted() -> ssl.SSLContext:
+    """The certificates that are trusted, which take a tenth of a second to read."""
+    trusted: ssl.SSLContext = httpx2.create_ssl_context(trust_env=False)
+    return trusted
 
 
 async def _listed(settings: dict[str, Any], key: str, http: httpx2.AsyncClient) -> list[str]:

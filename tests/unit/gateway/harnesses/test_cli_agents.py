@@ -18,6 +18,12 @@ pytestmark = pytest.mark.slow
 both = pytest.mark.parametrize("harness", ["codex", "claude-code"])
 
 
+def in_turns(names: str, *rows: tuple[Any, ...]) -> pytest.MarkDecorator:
+    """For what the agents share: each row is of one of them."""
+    cases = [(("codex", "claude-code")[k % 2], *row) for k, row in enumerate(rows)]
+    return pytest.mark.parametrize(f"harness, {names}".split(", "), cases)
+
+
 def sessions_of(played: Played) -> set[str]:
     """Session ids that the fake kept."""
     return {path.stem for path in (played.folder / "fake").glob("*.json")}
@@ -54,16 +60,14 @@ def test_tokens_are_counted_as_the_paper_counts_them(tmp_path: Path, harness: st
     assert tokens == known
 
 
-@both
-@pytest.mark.parametrize(
-    ("scenario", "outcome", "n_sessions"),
-    [
-        ("work,rate_limit,rate_limit,work", ("agent_stopped", 2, 2), 1),
-        ("work,overloaded,overloaded,work", ("agent_stopped", 2, 2), 1),
-        ("work,crash,crash,work", ("agent_stopped", 2, 2), 1),
-        ("crash_at_once,work,work", ("agent_stopped", 2, 1), 1),
-        ("work,forgotten,work", ("agent_stopped", 2, 1), 2),
-    ],
+@in_turns(
+    "scenario, outcome, n_sessions",
+    ("work,rate_limit,rate_limit,work", ("agent_stopped", 2, 2), 1),
+    ("work,overloaded,overloaded,work", ("agent_stopped", 2, 2), 1),
+    ("work,crash,crash,work", ("agent_stopped", 2, 2), 1),
+    ("crash_at_once,work,work", ("agent_stopped", 2, 1), 1),
+    ("work,forgotten,work", ("agent_stopped", 2, 1), 2),
+    ("work,forgotten,work", ("agent_stopped", 2, 1), 2),
 )
 def test_a_failed_turn_is_retried_in_its_session_or_a_new_one(
     tmp_path: Path, harness: str, scenario: str, outcome: tuple[str, int, int], n_sessions: int
@@ -81,16 +85,14 @@ def test_a_failed_turn_is_retried_in_its_session_or_a_new_one(
         assert played.prompts[0]["message"] == played.prompts[1]["message"]
 
 
-@both
-@pytest.mark.parametrize(
-    ("scenario", "more", "reason", "details", "n_starts"),
-    [
-        ("crash_at_once", {"retries": 2}, "agent_failed", ("3 times in a row", "exit status 139"), 3),
-        ("overloaded", {"retries": 0, "max_pause_s": 0.02}, "agent_failed", ("paused for",), None),
-        ("bad_key", {}, "agent_failed", ("401",), 1),
-        ("idle", {"reprompts": 2}, "agent_stopped", ("4 episodes left after 2 reminders",), 3),
-        ("idle", {"max_tokens": 1500}, "agent_stopped", ("cap reached",), 2),
-    ],
+@in_turns(
+    "scenario, more, reason, details, n_starts",
+    ("crash_at_once", {"retries": 2}, "agent_failed", ("3 times in a row", "exit status 139"), 3),
+    ("overloaded", {"retries": 0, "max_pause_s": 0.02}, "agent_failed", ("paused for",), None),
+    ("bad_key", {}, "agent_failed", ("401",), 1),
+    ("bad_key", {}, "agent_failed", ("401",), 1),
+    ("idle", {"reprompts": 2}, "agent_stopped", ("4 episodes left after 2 reminders",), 3),
+    ("idle", {"max_tokens": 1500}, "agent_stopped", ("cap reached",), 2),
 )
 def test_an_agent_that_gets_no_further_ends_with_the_reason(
     tmp_path: Path,
@@ -107,10 +109,9 @@ def test_an_agent_that_gets_no_further_ends_with_the_reason(
     assert n_starts in (None, len(played.starts))
 
 
-@both
-def test_an_outage_pauses_the_run_and_it_goes_on_afterwards(tmp_path: Path, harness: str) -> None:
+def test_an_outage_pauses_the_run_and_it_goes_on_afterwards(tmp_path: Path) -> None:
     scenario = ",".join(["overloaded"] * 4 + ["work"])
-    played = play(tmp_path, settings(harness, retries=1, provider="p"), scenario, budget=2)
+    played = play(tmp_path, settings("codex", retries=1, provider="p"), scenario, budget=2)
     assert (played.ending.reason, played.ending.turns) == ("agent_stopped", 1)
     assert played.ending.retries == 4
     paused = [doing for doing in played.doings if doing.paused_s]
@@ -135,19 +136,17 @@ def test_odd_streams_are_read(tmp_path: Path, harness: str, oddity: str) -> None
     assert max(map(len, played.text.splitlines())) < 2 << 20
 
 
-@both
-def test_a_silent_cli_is_ended_and_its_session_resumed(tmp_path: Path, harness: str) -> None:
-    played = play(tmp_path, settings(harness, silence_s=1.0), "silent,work", budget=2)
+def test_a_silent_cli_is_ended_and_its_session_resumed(tmp_path: Path) -> None:
+    played = play(tmp_path, settings("claude-code", silence_s=1.0), "silent,work", budget=2)
     assert played.outcome == ("agent_stopped", 1, 1)
     (failed,) = [line for line in played.log if line.get("type") == "turn_failed"]
     assert "no output" in failed["message"]
     assert "resume" in " ".join(played.starts[1])
 
 
-@both
-def test_an_endless_stream_is_ended_and_keeps_its_facts(tmp_path: Path, harness: str) -> None:
+def test_an_endless_stream_is_ended_and_keeps_its_facts(tmp_path: Path) -> None:
     played = play(
-        tmp_path, settings(harness, model="m"), "work,endless", budget=9, over_when=thinks_without_end
+        tmp_path, settings("claude-code", model="m"), "work,endless", budget=9, over_when=thinks_without_end
     )
     assert played.ending.facts["model_string"] == "m"
     assert played.ending.facts["tokens"]["output"] >= 20
@@ -155,10 +154,9 @@ def test_an_endless_stream_is_ended_and_keeps_its_facts(tmp_path: Path, harness:
     assert played.ending.retries == 0
 
 
-@both
-def test_an_agent_is_not_reminded_while_its_submit_runs(tmp_path: Path, harness: str) -> None:
+def test_an_agent_is_not_reminded_while_its_submit_runs(tmp_path: Path) -> None:
     # A submit while another runs is refused: without the wait the only reminder would come to nothing.
-    played = play(tmp_path, settings(harness, reprompts=1), "idle,work", budget=2, asked_in_flight=3)
+    played = play(tmp_path, settings("codex", reprompts=1), "idle,work", budget=2, asked_in_flight=3)
     assert (played.ending.turns, played.ending.detail) == (2, "")
 
 

@@ -45,42 +45,42 @@ def played(tmp_path: Path, api: ApiName, script: list[Step], **more: Any) -> tup
         return play(tmp_path, config_for(api, base, **more), ""), server
 
 
-@apis
-def test_a_model_edits_submits_and_is_prompted_again_in_its_session(tmp_path: Path, api: ApiName) -> None:
+@pytest.mark.parametrize(("api", "turns"), [("chat", 2), ("responses", 1), ("messages", 1), ("gemini", 1)])
+def test_a_model_edits_submits_and_is_prompted_again_in_its_session(
+    tmp_path: Path, api: ApiName, turns: int
+) -> None:
+    """What a second turn knows of the first with the other APIs: tests/unit/gateway/harnesses/test_llm_providers.py."""
     prices = Prices(input=1.0, output=10.0, cache_read=0.1)
-    script = [Said(commands=(SUBMIT,), reasoning="hm"), Said(text="first", reasoning="so")] * 2
+    script = [Said(commands=(SUBMIT,), reasoning="hm"), Said(text="done", reasoning="so")] * turns
     with ProviderApi(api, script) as server:
-        run = play(tmp_path, config_for(api, server.base_url, prices=prices), "")
+        config = config_for(api, server.base_url, prices=prices, reprompts=turns - 1)
+        run = play(tmp_path, config, "")
     # The second turn knows the first, or the server would refuse it.
-    assert run.outcome == ("agent_stopped", 2, 0), run.ending.detail
-    assert run.turns == [(1, "first"), (2, "first")]
-    assert (tmp_path / "workspace/system/policy.py").read_text() == "# better\n# better\n"
+    assert run.outcome == ("agent_stopped", turns, 0), run.ending.detail
+    assert run.turns == [(turn + 1, "done") for turn in range(turns)]
+    assert (tmp_path / "workspace/system/policy.py").read_text() == "# better\n" * turns
     tokens = run.ending.facts["tokens"]
-    assert (server.n_answered, len(server.requests)) == (4, 4)
+    n = 2 * turns
+    assert (server.n_answered, len(server.requests)) == (n, n)
     assert tokens == {
-        "input_noncached": 4 * FRESH,
-        "cache_read": 4 * CACHED,
+        "input_noncached": n * FRESH,
+        "cache_read": n * CACHED,
         "cache_creation": 0,
-        "output": 4 * OUTPUT,
-        "cost": pytest.approx(4 * (FRESH + 0.1 * CACHED + 10 * OUTPUT) / 1e6),
+        "output": n * OUTPUT,
+        "cost": pytest.approx(n * (FRESH + 0.1 * CACHED + 10 * OUTPUT) / 1e6),
     }
     assert any(doing.action.startswith("$ echo '# better'") for doing in run.doings)
     assert metadata.version("pydantic-ai-slim") in run.ending.facts["cli_version"]
 
 
 @mostly_one
-def test_neither_its_commands_nor_its_log_have_the_key(tmp_path: Path, api: ApiName) -> None:
-    run, server = played(tmp_path, api, [Step(command="env"), Step(text="done")], reprompts=0)
-    assert "EVOPOLICYGYM_SUBMIT_URL" in str(server.requests[1])
+def test_a_busy_provider_is_asked_again_and_nothing_shows_the_key(tmp_path: Path, api: ApiName) -> None:
+    script = [Step(status=503, text="overloaded"), Step(command="env"), Step(text="done")]
+    run, server = played(tmp_path, api, script, reprompts=0)
+    assert (run.ending.reason, run.ending.retries) == ("agent_stopped", 0), run.ending.detail
+    assert "EVOPOLICYGYM_SUBMIT_URL" in str(server.requests[-1])
     assert KEY not in str(server.requests)
     assert KEY not in run.text
-
-
-@mostly_one
-def test_a_busy_provider_is_asked_again_within_the_turn(tmp_path: Path, api: ApiName) -> None:
-    script = [Step(status=503, text="overloaded"), Step(command=SUBMIT), Step(command=SUBMIT)]
-    run, _ = played(tmp_path, api, [*script, Step(text="done")])
-    assert (run.ending.reason, run.ending.retries) == ("agent_stopped", 0), run.ending.detail
 
 
 @mostly_one
