@@ -13,7 +13,6 @@
 # make check-envs  plays every environment of every family, and writes the tables in docs/reference/environments/
 # make bench  what an episode costs, beside a bare loop
 # make bench-start        what one waits for before anything is played
-# make bench-replay       how far Codex and Claude Code are replayed, where they are installed
 # make bench-peers        the same episodes through Gymnasium's vectors, Ray and Dask, where they are installed
 # make bench-against      small submits of another revision and of the files here, in turns; ARGS="--revision REV"
 # make bench-throughput   episodes per second through the coordinator
@@ -36,7 +35,7 @@ FAMILIES := $(VENV)/.families
 STAMP := $(VENV)/.installed
 
 .DEFAULT_GOAL := help
-.PHONY: help install families paper-worker demo test test-root test-system test-families test-long test-cluster check check-envs docs release bench bench-start bench-replay bench-peers bench-against bench-throughput bench-scale bench-channels bench-coverage bench-isolation bench-costs faults sim clean
+.PHONY: help install families paper-worker demo test test-root test-system test-families test-long test-cluster check check-envs docs release bench bench-start bench-peers bench-against bench-throughput bench-scale bench-channels bench-coverage bench-isolation bench-costs faults sim clean
 
 help:
 	@sed -n 's/^# make/make/p' Makefile
@@ -132,10 +131,6 @@ bench: install
 # Help, the first episode, a trial, a report: each beside a bare Python with the same imports.
 bench-start: install
 	@PYTHONPATH=tests/bench $(BIN)/python tests/bench/start_bench.py $(ARGS)
-
-# Real CLIs: EVOPOLICY_REAL_CLIS=~/clis/node_modules/.bin make bench-replay ARGS="--runs 4 --clis codex"
-bench-replay: install
-	@PYTHONPATH=tests/bench:tests/support $(BIN)/python tests/bench/replay_bench.py $(ARGS)
 
 # Peers of another Python: make bench-peers ARGS="--python /path/to/python"
 bench-peers: install
