@@ -111,24 +111,6 @@ async def test_signal_ends_it_in_good_order_also_while_others_wait_for_it(
     assert not list(coordinator.state.glob("*-wal"))
 
 
-def test_second_coordinator_on_one_state_folder_is_refused(coordinator: Coordinator) -> None:
-    second = command("--state", coordinator.state)
-    assert second.returncode == 2
-    assert f"in use by another coordinator (process {coordinator.process.pid})" in second.stderr
-    assert len(second.stderr.splitlines()) == 1
-    assert coordinator.stop() == 0
-
-
-def test_port_that_is_taken_is_reported(tmp_path: Path) -> None:
-    first = Coordinator(tmp_path / "first", "--listen", "tcp/127.0.0.1:0")
-    try:
-        second = command("--state", tmp_path / "second", "--listen", first.ready["endpoints"][1])
-        assert second.returncode == 1
-        assert "cannot listen" in second.stderr
-    finally:
-        first.kill()
-
-
 @pytest.mark.parametrize(
     ("args", "message"),
     [

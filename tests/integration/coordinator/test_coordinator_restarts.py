@@ -158,66 +158,6 @@ def test_a_run_goes_on_from_a_backup_on_another_machine(tmp_path: Path) -> None:
         third.kill()
 
 
-def test_accepted_submit_survives_kill_before_any_result(tmp_path: Path, holder: list[Coordinator]) -> None:
-    async def scenario() -> None:
-        async with operator_of(holder[0]) as operator:
-            created = await operator.create()
-            async with gateway_of(holder[0], created) as gateway:
-                accepted = await gateway.submit(bundle_of("# policy"), (0, 1), "key")
-                holder[0].kill()
-                holder[0] = Coordinator(tmp_path / "state")
-                assert await gateway.submit(bundle_of("# policy"), (0, 1), "key") == accepted
-                async with working(holder[0]):
-                    _, done = await gateway.results(0)
-                assert done.status == "ok"
-                assert (await gateway.state()).remaining_budget == 14
-            assert (await operator.create()) == created
-
-    run(scenario, 120)
-
-
-def test_results_handed_in_twice_over_a_restart_are_taken_once(
-    tmp_path: Path, holder: list[Coordinator]
-) -> None:
-    async def scenario() -> None:
-        async with operator_of(holder[0]) as operator, connect(holder[0].credentials("worker")) as link:
-            worker = InstantWorker(link)
-            await worker.register()
-            created = await operator.create()
-            async with gateway_of(holder[0], created) as gateway:
-                await gateway.submit(bundle_of("# policy"), (0, 1), "key")
-                leases = await worker.lease(2)
-                results = tuple(worker.result(lease) for lease in leases)
-                assert len(results) == 2
-                await worker.report_results(results)
-                holder[0].kill()
-                holder[0] = Coordinator(tmp_path / "state")
-                await worker.register()
-                await worker.report_results(results)
-                episodes, _ = await gateway.results(0)
-                assert sorted(episode.index for episode in episodes) == [0, 1]
-
-    run(scenario, 120)
-
-
-def test_finished_run_is_reported_after_a_restart(tmp_path: Path, holder: list[Coordinator]) -> None:
-    async def scenario() -> None:
-        async with working(holder[0]):
-            finished = await whole_run(holder[0])
-        assert holder[0].stop() == 0
-        holder[0] = Coordinator(tmp_path / "state")
-        async with operator_of(holder[0]) as operator:
-            created = await operator.create()
-            assert created.run == finished.run
-            assert await operator.finished(created.run) == finished
-            async with gateway_of(holder[0], created) as gateway:
-                episodes, done = await gateway.results(1)
-                assert (len(episodes), done.status) == (2, "ok")
-                assert (await gateway.state()).is_finalized
-
-    run(scenario, 120)
-
-
 def test_workers_find_the_same_coordinator_after_an_orderly_restart(tmp_path: Path) -> None:
     holder = [Coordinator(tmp_path / "state", "--listen", "tcp/127.0.0.1:0")]
     endpoint = holder[0].ready["endpoints"][-1]

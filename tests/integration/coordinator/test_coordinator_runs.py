@@ -17,8 +17,6 @@ from coordinator_harness import (
     working,
 )
 
-from evopolicy_common.errors import RefusedError
-
 
 async def play_two_submits(gateway: GatewayClient) -> None:
     for number in range(2):
@@ -81,85 +79,6 @@ async def test_feedback_is_what_was_handed_in_and_nothing_more(coordinator: Coor
                 assert episode.stdout == b"hello"
             again, _ = await gateway.results(0)
             assert again == episodes
-
-
-async def test_repeated_keys_charge_once_and_make_one_run(coordinator: Coordinator) -> None:
-    async with operator_of(coordinator) as operator, working(coordinator):
-        created = await operator.create()
-        assert await operator.create() == created
-        async with gateway_of(coordinator, created) as gateway:
-            first = await gateway.submit(bundle_of("# policy"), (0, 1), "same")
-            assert await gateway.submit(bundle_of("# policy"), (0, 1), "same") == first
-            await gateway.results(0)
-            assert (await gateway.state()).remaining_budget == 14
-
-
-async def test_rejected_requests_cost_no_budget(coordinator: Coordinator) -> None:
-    async with operator_of(coordinator) as operator, working(coordinator):
-        created = await operator.create()
-        async with gateway_of(coordinator, created) as gateway:
-            bundle = bundle_of("# policy")
-            for ids, status in (
-                ((0,) * 17, "budget_invalid"),
-                ((), "budget_invalid"),
-                ((64,), "invalid_env_instance"),
-            ):
-                with pytest.raises(RefusedError) as refused:
-                    await gateway.submit(bundle, ids, f"key-{ids}")
-                assert refused.value.status == status, (ids, refused.value)
-            with pytest.raises(RefusedError) as refused:
-                await gateway.submit_digest("0" * 64, (0,), "nothing")
-            assert refused.value.status == "missing_bundle"
-            state = await gateway.state()
-            assert (state.remaining_budget, state.n_submits) == (16, 0)
-
-
-async def test_two_workers_share_a_submit(coordinator: Coordinator) -> None:
-    async with (
-        operator_of(coordinator) as operator,
-        working(coordinator, "w-1", slots=1) as first,
-        working(coordinator, "w-2", slots=1) as second,
-    ):
-        created = await operator.create(budget=64)
-        async with gateway_of(coordinator, created) as gateway:
-            await gateway.open()
-            await gateway.submit(bundle_of("# policy"), tuple(range(64)), "wide")
-            await gateway.results(0)
-        assert len({job.job_id for job in first.jobs + second.jobs}) >= 64
-        assert first.jobs
-        assert second.jobs
-
-
-async def test_evaluation_plays_cases_outside_any_run(coordinator: Coordinator) -> None:
-    async with operator_of(coordinator) as operator, working(coordinator):
-        bundle = bundle_of("# policy")
-        await operator.ask.upload("operator", operator.token, bundle.digest, bundle.packed)
-        tried = await operator.evaluate(
-            "try", bundle=bundle.digest, split="train", cases=(3, 3, 1), sandbox_tier="bwrap"
-        )
-        assert sorted(outcome.index for outcome in tried) == [0, 1, 2]
-        returns = {outcome.index: outcome.episode_return for outcome in tried}
-        assert returns[0] == returns[1] != returns[2]
-        reference = await operator.evaluate(
-            "random", bundle=None, split="heldout", cases=None, record="actions"
-        )
-        assert len(reference) == 32
-        with pytest.raises(RefusedError, match="case 64 of toy/line"):
-            await operator.evaluate("wrong", bundle=None, split="train", cases=(64,))
-
-
-async def test_worker_that_comes_late_finds_the_submit_waiting(coordinator: Coordinator) -> None:
-    async with operator_of(coordinator) as operator:
-        created = await operator.create()
-        async with gateway_of(coordinator, created) as gateway:
-            await gateway.submit(bundle_of("# policy"), (0, 1), "early")
-            in_flight = (await gateway.state()).in_flight
-            assert in_flight is not None
-            assert in_flight.n_done == 0
-            assert in_flight.waits_for
-            async with working(coordinator):
-                _, done = await gateway.results(0)
-            assert done.status == "ok"
 
 
 def test_same_submits_give_the_same_run_whatever_the_workers(tmp_path: Path) -> None:

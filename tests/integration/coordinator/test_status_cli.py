@@ -10,7 +10,6 @@ import signal
 import subprocess
 import sys
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import msgspec
@@ -143,20 +142,6 @@ async def worker_shown(operator: OperatorClient, name: str) -> WorkerStatus:
             if worker.worker == name:
                 return worker
         await asyncio.sleep(0.02)
-
-
-def test_refusals_are_reported_in_a_line_and_exit_1(coordinator: Coordinator) -> None:
-    result = call(coordinator, "runs", "cancel", "r-nowhere")
-    assert result.exit_code == 1
-    assert "r-nowhere" in result.stderr
-    assert len(result.stderr.splitlines()) == 1
-
-
-def test_wrong_usage_exits_2(coordinator: Coordinator, tmp_path: Path) -> None:
-    assert call(coordinator, "status", "--watched").exit_code == 2
-    result = CliRunner().invoke(status_app, ["--credentials", str(tmp_path / "none.json")])
-    assert result.exit_code == 2
-    assert "none.json" in result.stderr
 
 
 WATCH = "from evopolicy_coordinator.cli.status import status_app; status_app()"

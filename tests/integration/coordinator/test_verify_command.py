@@ -176,8 +176,3 @@ def test_without_the_coordinator_a_tampered_action_shows_in_its_results(
 def test_a_cluster_with_other_cases_says_so_and_stops(played: Played) -> None:
     said = played.verify(played.run("toy/line"), where=("--local",), code=2)["said"]
     assert "train cases of toy/line are not the run's" in said
-
-
-def test_a_folder_without_a_run_is_wrong_usage(tmp_path: Path) -> None:
-    done = evopolicy(tmp_path, "verify", str(tmp_path), "--local", code=2)
-    assert "is not the directory of a finished run" in done.stderr

@@ -78,14 +78,6 @@ async def test_info_tells_the_run_and_the_submit_that_runs(tmp_path: Path) -> No
         }
 
 
-async def test_task_is_markdown_with_spaces_bounds_and_scope(tmp_path: Path) -> None:
-    async with served(tmp_path) as s:
-        answer = await s.http.get(s.urls.task)
-        assert answer.headers["content-type"].startswith("text/markdown")
-        for needed in ("# A line", "Visible ids: 0 to 7", '"type": "Box"', "scope `episode`", "not seeded"):
-            assert needed in answer.text
-
-
 async def test_an_unwaited_submit_is_asked_for_until_it_is_done(tmp_path: Path) -> None:
     async with served(tmp_path) as s:
         s.double.go.clear()
@@ -187,23 +179,6 @@ async def test_a_body_of_100_megabytes_is_refused_and_the_refusal_is_heard(tmp_p
         assert chunked.status_code == 400
         assert chunked.json()["status"] == "budget_invalid"
         assert (await s.submit([0])).status_code == 200
-
-
-async def test_a_client_without_the_token_learns_nothing(tmp_path: Path) -> None:
-    async with served(tmp_path) as s:
-        parts = urlsplit(s.urls.info)
-        root = f"{parts.scheme}://{parts.netloc}"
-        token = parts.path.split("/")[1]
-        assert len(bytes.fromhex(token)) * 8 == 128
-        wrong = ["", "info", f"{'0' * 32}/info", f"{token}x/info", "/info"]
-        wrong += [f"{token}/nothing", f"{token}/../etc/passwd"]
-        answers = [await s.http.get(f"{root}/{path}") for path in wrong]
-        assert {answer.status_code for answer in answers} == {404}
-        assert len({answer.content for answer in answers}) == 1
-        assert (await s.http.put(s.urls.submit, content=b"x")).status_code == 405
-        for answer in answers:
-            assert s.double.capability not in answer.text
-            assert "server" not in answer.headers
 
 
 async def test_headers_without_end_are_cut_off(tmp_path: Path) -> None:

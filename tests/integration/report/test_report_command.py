@@ -6,8 +6,6 @@ import csv
 import json
 import os
 import re
-import subprocess
-import sys
 from html.parser import HTMLParser
 from pathlib import Path
 from urllib.parse import unquote
@@ -21,8 +19,6 @@ from typer.testing import CliRunner
 
 from evopolicy_results.cli.report import app
 from evopolicy_results.notebook import figures_of, rows, write_report
-from evopolicy_results.reading.parallel import Processes
-from evopolicy_results.report import write_report as write
 from evopolicy_results.scoring.scores import paper_rows, paper_text
 from evopolicy_results.studies.study import study
 
@@ -176,22 +172,6 @@ def test_index_is_self_contained(report: Path) -> None:
     assert text.count('<svg role="img"') == len(list((report / "figures").glob("*.svg")))
 
 
-@pytest.mark.system
-def test_progress_of_each_stage_has_a_total_that_stays(runs: Path, tmp_path: Path) -> None:
-    told: dict[str, list[tuple[int, int]]] = {}
-    found = study([runs])
-
-    def tell(what: str, done: int, total: int) -> None:
-        told.setdefault(what, []).append((done, total))
-
-    with Processes(2) as processes:
-        write(found, tmp_path / "report", progress=tell, processes=processes)
-    assert list(told) == ["figures", "run pages", "tables"]
-    for steps in told.values():
-        assert [done for done, _ in steps] == list(range(1, len(steps) + 1))
-        assert {total for _, total in steps} == {len(steps)}
-
-
 def test_suites_are_groups_of_one_table_and_sections_have_one_order(report: Path) -> None:
     text = (report / "index.html").read_text()
     assert "<h1>Core16 (2 of 16), Toy line: policy evolution report</h1>" in text
@@ -203,25 +183,6 @@ def test_suites_are_groups_of_one_table_and_sections_have_one_order(report: Path
         assert {row.get("suite", "Core16 (2 of 16)") for row in table(report, name)} == {"Core16 (2 of 16)"}
     assert {row["suite"] for row in table(report, "heldout")} == {"Core16 (2 of 16)", "Toy line"}
     assert not list((report / "figures").glob("rank_scores_toy*"))
-
-
-def test_columns_without_any_value_are_not_on_the_page(report: Path) -> None:
-    text = (report / "index.html").read_text()
-    for table in re.findall(r'<table class="data[^"]*".*?</table>', text, re.DOTALL):
-        rows = [
-            re.findall(r"<t[dh][^>]*>(.*?)</t[dh]>", row) for row in table.split("<tbody>")[1].split("</tr>")
-        ]
-        for column in zip(*[row for row in rows if row], strict=True):
-            assert set(column) != {"–"}, table[:200]
-
-
-def test_evopolicy_has_report_as_a_plain_command(tmp_path: Path) -> None:
-    write_run(tmp_path / "runs", PLAIN)
-    command = [sys.executable, "-c", "from evopolicy_gateway.cli.main import main; main()", "report"]
-    arguments = [str(tmp_path / "runs"), "--out", str(tmp_path / "report")]
-    done = subprocess.run([*command, *arguments], capture_output=True, text=True, timeout=120, check=False)
-    assert done.returncode == 0, done.stderr
-    assert "1 run, 0 left out" in done.stdout
 
 
 def test_left_out_run_is_listed_with_its_reason(report: Path) -> None:
@@ -326,13 +287,6 @@ def test_replay_path_that_leads_out_of_the_run_is_not_followed(tmp_path: Path) -
     report = report_on(tmp_path)
     assert not list(report.rglob("*.png.*"))
     assert "its file is missing" in (report / "replays/gym-acrobot.html").read_text()
-
-
-def test_run_without_any_ok_submit_is_in_the_report(tmp_path: Path) -> None:
-    write_run(tmp_path / "runs", [Version({"policy.py": "import x\n"}, (0.0,), None, "import_error")])
-    write_run(tmp_path / "runs", [], entry="Idle")
-    board = table(report_on(tmp_path), "heldout")
-    assert [row["gym/acrobot"] for row in board] == ["-500.0", "", ""]
 
 
 def test_notebook_example_of_the_package_works(runs: Path, tmp_path: Path) -> None:

@@ -276,28 +276,8 @@ def test_a_spent_remote_run_is_scored_once_its_agent_has_ended(operator_file: Pa
     assert (run.record.outcome.closed_reason, run.record.hidden_isolation) == ("budget_spent", "exclusive")
 
 
-def test_a_remote_run_whose_operator_vouches_for_its_agent_ends_by_itself(
-    operator_file: Path, tmp_path: Path
-) -> None:
-    with remote_run(operator_file, tmp_path, "--agent-host", "elsewhere") as run:
-        assert run.submit([0, 1, 2, 3]) == (200, "ok")
-    assert (run.record.outcome.closed_reason, run.record.hidden_isolation) == ("budget_spent", "waived")
-
-
 def test_a_remote_run_ends_when_its_agents_time_is_over(operator_file: Path, tmp_path: Path) -> None:
     options = ("--agent-wall-s", "1", "--agent-host", "elsewhere")
     with remote_run(operator_file, tmp_path, *options, code=3) as run:
         pass
     assert run.record.outcome.closed_reason == "wall_limit"
-
-
-def test_finish_is_refused_where_no_remote_agent_plays(tmp_path: Path) -> None:
-    done = subprocess.run(
-        [sys.executable, "-m", "evopolicy_gateway.cli", "finish", str(tmp_path)],
-        capture_output=True,
-        text=True,
-        timeout=TIMEOUT_S,
-        check=False,
-    )
-    assert done.returncode == 2
-    assert "no open run of a remote agent" in done.stderr

@@ -42,7 +42,6 @@ def does(what: str, says: str, *options: str, code: int = 1) -> Row:
     return Row(says, file=f'kwargs = {{ does = "{what}" }}', options=options, code=code)
 
 
-SLOW = {"env_timeout": "3", "env_memory": "512"}
 TABLE = {
     "crash": does(
         "crash", rf"step 11: it raised ValueError: fell off the table; .*{SOURCE}crash_in_step_12: raise"

@@ -7,10 +7,8 @@ import json
 from pathlib import Path
 
 import pytest
-from commands import Plays, agent, command, ended, ran_on, record_in, run_arguments, run_dir
+from commands import Plays, agent, command, ended, record_in, run_arguments, run_dir
 from waiting import wait_until
-
-from evopolicy_common.records.summary import decode_summary
 
 
 def test_a_prompted_agent_gets_turns_until_it_stops(ran: Plays) -> None:
@@ -51,26 +49,6 @@ def test_an_agent_that_does_nothing_is_ended_by_its_wall_limit(ran: Plays) -> No
     played = ran("submit([0, 1])\ntime.sleep(1000)", "--agent-wall-s", "2")
     outcome = played.record.outcome
     assert (outcome.closed_reason, outcome.budget_used, outcome.status) == ("wall_limit", 2, "completed")
-
-
-def test_an_agents_children_are_gone_however_they_hide(ran: Plays) -> None:
-    code = """
-hide = (
-    "import os, signal, sys, time\\n"
-    "signal.signal(signal.SIGTERM, signal.SIG_IGN)\\n"
-    "os.setsid() if os.getsid(0) != os.getpid() else None\\n"
-    "if os.fork(): os._exit(0)\\n"
-    "open(sys.argv[1], 'w').write(str(os.getpid()))\\n"
-    "time.sleep(1000)\\n"
-)
-subprocess.Popen([sys.executable, "-c", hide, "child.pid"], start_new_session=True)
-while not os.path.exists("child.pid"):
-    time.sleep(0.01)
-submit([0])
-"""
-    played = ran(code, "--jail", "none")
-    child = int((played.folder / "workspace" / "child.pid").read_text())
-    assert not Path(f"/proc/{child}").exists()
 
 
 BAD_INPUT = """
@@ -161,23 +139,6 @@ def test_without_an_ok_submit_the_exit_code_says_so(ran: Plays) -> None:
     assert (outcome.status, outcome.final_score, outcome.best_submit_index) == ("no_ok_submit", 0.0, None)
     assert outcome.budget_used == 2
     assert "no working submit" in played.out
-
-
-def test_replay_submits_the_policies_in_order_with_even_shares(operator_file: Path, tmp_path: Path) -> None:
-    policy = "class Policy:\n  def __init__(self, *a): pass\n  def reset(self, i): pass\n  def act(self, obs): return [{}]\n"  # noqa: E501
-    for name, push in (("b", 0.5), ("a", -0.5)):
-        (tmp_path / "given" / name / "system").mkdir(parents=True)
-        (tmp_path / "given" / name / "system" / "policy.py").write_text(policy.format(push))
-    folder = ran_on(operator_file, tmp_path, "replay:given", "--budget", "5").folder
-    assert folder.parts[-3] == "replay-given"
-    sources = [(folder / f"checkpoints/submit_00{i}/policy.py").read_text() for i in range(2)]
-    assert "-0.5" in sources[0]
-    assert "-0.5" not in sources[1]
-    summaries = [
-        decode_summary((folder / f"workspace/feedback/submit_00{i}/summary.json").read_bytes())
-        for i in range(2)
-    ]
-    assert [summary.env_instances for summary in summaries] == [(0, 1, 2), (0, 1)]
 
 
 @pytest.mark.system

@@ -49,28 +49,3 @@ def test_try_leaves_cases_with_a_failure_out_of_the_mean(operator_file: Path, tm
     assert "policy to step 2, then random" in out
     assert "[/x] \ufffd[2J broken" in out
     assert "over 2 of 3 cases; 1 case left out, in which the policy failed" in out
-
-
-def test_a_policy_that_fails_in_every_case_has_no_mean(operator_file: Path, tmp_path: Path) -> None:
-    (tmp_path / "policy.py").write_text("class Policy:\n  pass\n")
-    where = ["--env", "toy/line", "--credentials", str(operator_file), "--cases", "0-1"]
-    out, _ = ended(tmp_path, "try", ".", "--json", *where, ends=1)
-    (result,) = json.loads(out)
-    assert (result["mean_return"], result["std_return"], result["n_failed"]) == (None, None, 2)
-    assert result["episodes"][0]["episode_return"] is None
-
-
-def test_the_same_ids_are_the_same_cases_in_the_next_call(operator_file: Path, tmp_path: Path) -> None:
-    (tmp_path / "policy.py").write_text(
-        "class Policy:\n"
-        "  def __init__(self, obs_space, action_space, env_meta): pass\n"
-        "  def reset(self, i): pass\n"
-        "  def act(self, obs): return [obs[2] - obs[0]]\n"
-    )
-    where = ["--env", "toy/line", "--credentials", str(operator_file), "--json"]
-    returns = []
-    for cases in ("0-3", "2,3,0,1"):
-        out, _ = ended(tmp_path, "try", ".", *where, "--cases", cases)
-        returns.append({one["case"]: one["episode_return"] for one in json.loads(out)[0]["episodes"]})
-    assert returns[0] == returns[1]
-    assert len(set(returns[0].values())) == 4
