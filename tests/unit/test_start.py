@@ -5,13 +5,8 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-import tomllib
-from pathlib import Path
 
 import pytest
-import typer
-
-from evopolicy_gateway.cli.main import HELPS, app
 
 LARGE = {
     *(
@@ -87,20 +82,6 @@ def test_processes_log_without_importing_rich() -> None:
     found = imported(f"{LISTED}import {', '.join((*names, more))}; print('imported')")
     assert {"structlog", *names, more} <= found
     assert "rich" not in found
-
-
-def test_commands_are_found_by_the_table_alone() -> None:
-    """An entry point of the group that there once was would be a command that nobody finds."""
-    project = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text())["project"]
-    assert project.get("entry-points", {}).keys() <= {"inspect_ai"}
-
-
-@pytest.mark.parametrize("name", HELPS)
-def test_the_help_of_evopolicy_describes_a_command_as_its_own_help_does(name: str) -> None:
-    front = typer.main.get_command(app)
-    command = front.commands[name]  # type: ignore[attr-defined]
-    assert command.name == name
-    assert HELPS[name] == command.get_short_help_str(1000)
 
 
 CTRL_C = """

@@ -11,9 +11,9 @@ from rich.table import Table
 from rich.text import Text
 
 from evopolicy_common.cli.conventions import fail, setup_logging, setup_notices
-from evopolicy_common.console import Terminal, filled_table
+from evopolicy_common.console import Terminal
 from evopolicy_common.logs import structlog
-from evopolicy_common.terminal import harmless, one_line, say, say_json, say_lines
+from evopolicy_common.terminal import one_line, say, say_json, say_lines
 
 STEERING = [
     "\x1b[2J\x1b[1;1Hscore 100",  # clears the screen
@@ -117,20 +117,3 @@ def test_log_lines_on_a_terminal_are_harmless(text: str, monkeypatch: pytest.Mon
     output = stderr.getvalue()
     assert "said" in output
     assert not any(piece in output for piece in ("\x1b[2J", "\x1b]", "\x9b", "\x9d", "\u202e", "\udcff"))
-
-
-def test_printable_text_stays_as_it_is() -> None:
-    text = "a – ü 漢 [/x] 100 %\n\tb"
-    assert harmless(text) == text
-
-
-def test_a_narrow_table_breaks_no_short_word_and_has_no_empty_column() -> None:
-    out = io.StringIO()
-    rows = [
-        ("extra coordinator", "ok", "cryptography, jinja2, matplotlib", ""),
-        ("disk", "ok", "55 GiB free", ""),
-    ]
-    Terminal(file=out, width=40).print(filled_table(("check", "verdict", "found", "remedy"), rows))
-    shown = out.getvalue()
-    assert "remedy" not in shown
-    assert {"coordinator", "cryptography,", "matplotlib"} <= set(shown.split())

@@ -8,7 +8,6 @@ files.
 from __future__ import annotations
 
 import configparser
-import fnmatch
 import itertools
 import os
 import re
@@ -89,12 +88,6 @@ def test_only_wrong_options_keep_a_unit_down(name: str) -> None:
     assert unit["Service"]["Restart"] == "always"
     assert unit["Service"]["RestartPreventExitStatus"] == str(USAGE_ERROR)
     assert unit["Unit"]["StartLimitIntervalSec"] == "0"
-
-
-def test_parsing_a_command_finds_an_option_that_is_not_there() -> None:
-    for words in (["evopolicy-worker", "--gpu"], ["evopolicy-coordinator", "certs", "issue", "--gpu", "x"]):
-        with pytest.raises(Exception, match="gpu"):
-            parse(words)
 
 
 @pytest.mark.parametrize("name", UNITS)
@@ -316,27 +309,9 @@ def test_the_commands_of_the_readme_are_taken() -> None:
     assert len(parsed) >= 9
 
 
-def test_the_readme_names_every_file_and_no_other() -> None:
-    documented = set(
-        re.findall(
-            r"`(?:\w+/)?([\w@.-]+\.(?:service|env|conf|yaml|sbatch|sh|txt)|grafana-dashboard\.json|Dockerfile)`",
-            (DEPLOY / "README.md").read_text(),
-        )
-    )
-    there = {path.name for path in DEPLOY.rglob("*") if path.is_file()}
-    assert there - {"README.md", "Dockerfile.dockerignore"} == documented
-
-
 def _any() -> dict[str, str]:
     """Some value for every variable."""
     return {"EVOPOLICY_LISTEN": "", "EVOPOLICY_OPTIONS": "", "EVOPOLICY_WORKER_OPTIONS": ""}
-
-
-def test_dockerignore_lets_no_caches_through() -> None:
-    lines = (DEPLOY / "Dockerfile.dockerignore").read_text().splitlines()
-    assert any(fnmatch.fnmatchcase("common/evopolicy_common/__pycache__", line) for line in lines)
-    # README.md has the machines' keys there, and the last match wins.
-    assert lines.index("deploy/machines") > lines.index("!deploy")
 
 
 def test_the_wheel_takes_every_file_but_machines_keys() -> None:

@@ -40,11 +40,6 @@ def test_what_means_something_to_latex_is_escaped_and_the_best_are_marked() -> N
     assert "\\caption{50 \\% of it.}" in text
 
 
-def test_a_negative_number_has_a_true_minus() -> None:
-    below = Table(name="n", title="N", caption="", columns=TABLE.columns, rows=({"who": "-1", "x": -1.5},))
-    assert "\n-1 & $-$1.50 & -- & -- \\\\\n" in to_latex(below)
-
-
 @pytest.mark.parametrize(
     ("text", "latex"),
     [
@@ -78,18 +73,6 @@ def test_a_table_too_wide_is_in_panels_that_each_name_their_rows() -> None:
     assert text.count("\nagent 1 & ") == text.count("\\begin{tabular}")
     assert text.count(" & 1.500") == 48
     assert text.count("\\begin{table}") == text.count("\\label") == 1
-
-
-def test_long_texts_are_broken_into_lines_and_numbers_never() -> None:
-    text = to_latex(table(2, 3, 2))
-    spec = next(line for line in text.splitlines() if line.startswith("\\begin{tabular}"))
-    assert spec.count("p{12em}") == 2
-    assert spec.endswith("rrr}")
-
-
-def test_a_long_name_may_be_broken_where_it_has_joints() -> None:
-    text = to_latex(table(4, 6, 2, "gymnasium/MiniGrid-ObstructedMaze-1Q-v1"))
-    assert "gymnasium/\\allowbreak{}MiniGrid-\\allowbreak{}ObstructedMaze-" in text
 
 
 def test_entries_of_other_scripts_stay_apart_within_the_page() -> None:

@@ -8,27 +8,23 @@ import json
 from pathlib import Path
 from xml.etree import ElementTree
 
-import msgspec
 import pytest
 from invented.policies import Version, png, policy
 from invented.run_dirs import write_run
 from invented.small_table import TABLE
 
-from evopolicy_common import catalogue
 from evopolicy_results.behaviour.edits import classify, events_of, phases
-from evopolicy_results.behaviour.trace import diff, trace
+from evopolicy_results.behaviour.trace import trace
 from evopolicy_results.figures.plot import inline_svg
 from evopolicy_results.figures.policies import wilson
 from evopolicy_results.figures.style import new_figure, svg_text
 from evopolicy_results.figures.timelines import MAX_ROWS
 from evopolicy_results.notebook import figures_of
 from evopolicy_results.reading.agent_log import read_agent_log
-from evopolicy_results.reading.environments import suite_title
 from evopolicy_results.reading.reader import read_run
-from evopolicy_results.studies.palette import looks
 from evopolicy_results.studies.study import study
 from evopolicy_results.tables.report_tables import tables_of
-from evopolicy_results.tables.table import Column, Table, best_marks, texts_of, to_csv, to_markdown
+from evopolicy_results.tables.table import Column, Table, best_marks, to_csv, to_markdown
 
 
 def test_csv_keeps_full_precision_and_empty_fields() -> None:
@@ -81,26 +77,9 @@ def test_markdown_shows_text_and_no_html_links_or_images(text: str, written: str
     assert to_markdown(table_of(text)).splitlines()[-1] == f"| -1.500 | {written} |"
 
 
-@pytest.mark.parametrize(
-    ("value", "text"), [(0.0, "0.00"), (0.0001, "<0.01"), (0.0099, "<0.01"), (0.01, "0.01"), (0.014, "0.01")]
-)
-def test_number_too_small_to_show_is_told_from_nought(value: float, text: str) -> None:
-    column = Column("x", "X", "number", digits=2, below=True)
-    table = Table(name="t", title="T", caption="", columns=(column,), rows=({"x": value},))
-    assert texts_of(table, column) == [text]
-    assert texts_of(table, msgspec.structs.replace(column, below=False)) != ["<0.01"]
-
-
 def test_equal_best_values_share_the_mark_and_leave_no_second() -> None:
     assert best_marks([{"x": 1.0}, {"x": 1.0}, {"x": 0.0}], ["x"]) == {(0, "x"): 1, (1, "x"): 1}
     assert best_marks([{"x": 1.0}], ["x"]) == {}
-
-
-def test_agents_looks_follow_their_names_and_stay_distinct() -> None:
-    many = [f"agent {i:02d}" for i in range(25)]
-    found = looks(many, "Random policy")
-    assert found == looks(list(reversed(many)), "Random policy")
-    assert len({(look.colour, str(look.dash)) for look in found.values()}) == 26
 
 
 def test_phases_join_adjacent_edits_and_pass_over_events(tmp_path: Path) -> None:
@@ -160,20 +139,6 @@ def test_timelines_have_a_row_for_each_run_up_to_their_limit(tmp_path: Path) -> 
     assert {"first policy", "parametric edits", "does not"} <= set(texts)
     assert "rollback" not in texts
     assert "2 more runs have their timelines on their own pages." in plot.caption
-
-
-@pytest.mark.parametrize(
-    ("suite", "environments", "title"),
-    [
-        ("core16", catalogue.suites()["core16"].environments, "Core16"),
-        ("core16", ["gym/acrobot", "gym/ant5", "gym/racing"], "Core16 (3 of 16)"),
-        ("core16", ["gym/acrobot"], "Acrobot"),
-        ("other", ["my/kite"], "my/kite"),
-        ("other", ["my/glider", "my/kite"], "2 other environments"),
-    ],
-)
-def test_title_of_a_suite_tells_how_much_was_played(suite: str, environments: list[str], title: str) -> None:
-    assert suite_title(suite, environments) == title
 
 
 VERSIONS = [
@@ -246,14 +211,6 @@ def test_damaged_or_strange_log_lines_are_passed_over(tmp_path: Path) -> None:
     log.write_bytes(b"\n".join(strange))
     assert read_agent_log(log, run.submits).unplaced == ("hello",)
     assert read_agent_log(tmp_path / "absent", run.submits).unplaced == ()
-
-
-def test_diff_shows_changed_files_policy_first() -> None:
-    before = {"a.py": "x = 1\n", "policy.py": "import a\n"}
-    after = {"b.py": "y = 1\n", "policy.py": "import b\n"}
-    found = diff(before, after)
-    assert [one.path for one in found] == ["policy.py", "a.py", "b.py"]
-    assert found[0].lines == ("@@ -1 +1 @@", "-import a", "+import b")
 
 
 def test_many_repeats_are_drawn_as_mean_and_range(tmp_path: Path) -> None:

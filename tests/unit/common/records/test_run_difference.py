@@ -8,7 +8,7 @@ from typing import Any
 
 from typer.testing import CliRunner
 
-from evopolicy_common.records.run_difference import differences, shortened
+from evopolicy_common.records.run_difference import differences
 from evopolicy_gateway.cli.main import app
 
 
@@ -116,28 +116,3 @@ def test_runs_that_are_equal_do_not_differ_until_a_file_is_added(tmp_path: Path)
     diff(left, right, code=0)
     (right / "extra").touch()
     diff(left, right)
-
-
-def test_people_see_scores_first_and_folders_for_files(tmp_path: Path) -> None:
-    left, right = make_run(tmp_path, "a", returns=[2.0]), make_run(tmp_path, "b")
-    record = json.loads((right / "run.json").read_text())
-    record["outcome"] |= {"best_submit_index": 3, "final_score": 7.0}
-    (right / "run.json").write_text(json.dumps(record))
-    for number in range(30):
-        folder = left / "workspace/feedback/submit_001/episodes" / f"ep_{number:03d}"
-        folder.mkdir(parents=True)
-        (folder / "trajectory.jsonl").write_text("{}")
-    (right / "extra").touch()
-    found = differences(left, right)
-    assert len(found) > 30
-    shown = shortened(found, left, right)
-    assert shown[:2] == [
-        "run.json: outcome.final_score: 1.0 and 7.0",
-        "run.json: outcome.best_submit_index: nothing and 3",
-    ]
-    assert shown[-2:] == [
-        f"workspace/feedback/submit_001: only in {left} (30 files)",
-        f"extra: only in {right}",
-    ]
-    assert diff(left, right).startswith("run.json: outcome.final_score: 1.0 and 7.0\n")
-    assert json.loads(diff(left, right, "--json")) == found

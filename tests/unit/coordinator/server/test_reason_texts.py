@@ -49,46 +49,6 @@ def test_words_name_exactly_what_a_reason_is_about(code: str, about: set[str]) -
     assert about == wanted - {"state"}
 
 
-def test_a_reason_about_another_is_put_into_one_sentence() -> None:
-    missing = because(
-        "workers",
-        env="gym/x",
-        tier="bwrap",
-        same_versions=True,
-        away=("lost", "paused"),
-        connected=True,
-        lacking=(),
-        failed=(),
-    )
-    assert (
-        words(because("no_worker_yet", waits_for=missing))
-        == "the run waits for a worker that offers gym/x with sandbox tier bwrap, of the versions that the run started"
-        " with: those that do are lost or paused"
-    )
-
-
-def test_an_installation_is_advised_only_where_a_worker_is_connected() -> None:
-    """A local worker that is starting lacks none."""
-    missing = {"env": "gym/acrobot", "tier": "bwrap", "same_versions": False, "away": ()}
-    missing |= {"lacking": (), "failed": ()}
-    assert "setup gymnasium" in words(because("workers", connected=True, **missing))
-    assert (
-        words(because("workers", connected=False, **missing))
-        == "a worker that offers gym/acrobot with sandbox tier bwrap; no worker is connected yet"
-    )
-
-
-def test_a_tier_that_does_not_work_is_told_with_its_workers() -> None:
-    lacking = (("lab-1", "bwrap: No permissions to create a new namespace"), ("lab-2", "no bwrap on PATH"))
-    about = {"env": "gym/acrobot", "tier": "bwrap", "same_versions": False, "away": (), "connected": True}
-    about["failed"] = ()
-    assert (
-        words(because("workers", lacking=lacking, **about))
-        == "a worker that offers gym/acrobot with sandbox tier bwrap (the tier does not work on lab-1: bwrap: No"
-        " permissions to create a new namespace; lab-2: no bwrap on PATH)"
-    )
-
-
 def test_why_an_environment_failed_is_told_to_operators_alone() -> None:
     """Attack: fails its try-out with an error that tells an agent of the machine's files and code.
     Defence: agents learn on which worker it failed; only operators get the reason, of at most 2,000

@@ -3,20 +3,15 @@
 from __future__ import annotations
 
 import json
-import re
-from functools import partial
 from pathlib import Path
 
 import msgspec
-from invented.policies import Version
-from invented.run_dirs import write_run
 from invented.web_site import client, finished_run, open_run, open_status, site_of, status
 
 from evopolicy_common.messages.run_settings import Start
-from evopolicy_common.messages.status import DiskUse, QueuedJobs, RetriedJobs, WorkerStatus
+from evopolicy_common.messages.status import RetriedJobs
 from evopolicy_coordinator.web.content.cluster import _RETRIES_OF_A_RUN
 from evopolicy_coordinator.web.content.run_folders import key_of
-from evopolicy_results.figures.line_chart import Line, chart
 
 LOST = RetriedJobs(at=1_767_312_000.0, worker="w-attic", failure="worker_lost", jobs=3)
 FAILED = RetriedJobs(at=1_767_312_060.0, worker="w-cellar", failure="failed")
@@ -24,14 +19,6 @@ FAILED = RetriedJobs(at=1_767_312_060.0, worker="w-cellar", failure="failed")
 
 def key(folder: Path) -> str:
     return key_of(str(folder.resolve()))
-
-
-def worker(name: str, **more: object) -> WorkerStatus:
-    fields: dict[str, object] = {
-        "worker": name, "host": "lab", "slots": 2, "state": "active", "tiers": ("bwrap",), "environments": ("gym/acrobot",),  # noqa: E501
-        "fingerprint": "f" * 12, "versions": {"python": "3.11"}, "held": 0, "running": 0, "last_seen_s": 1.0,
-    }  # fmt: skip
-    return WorkerStatus(**{**fields, **more})  # type: ignore[arg-type]
 
 
 def test_lost_workers_and_retries_stand_among_a_runs_events(tmp_path: Path) -> None:
@@ -70,69 +57,6 @@ def test_retries_that_the_coordinator_no_longer_tells_of_are_kept_and_bounded(tm
         if number == 0:
             assert list(site.cluster.retries["r-open"]) == [LOST, later]
     assert len(site.cluster.retries["r-open"]) == _RETRIES_OF_A_RUN
-
-
-def test_a_finished_run_tells_how_many_jobs_were_played_again(tmp_path: Path) -> None:
-    folder = finished_run(tmp_path)
-    record = json.loads((folder / "run.json").read_text())
-    record["outcome"].setdefault("auxiliary", {})["infrastructure_retries"] = 7
-    (folder / "run.json").write_text(json.dumps(record))
-    with client(site_of(tmp_path)) as browser:
-        assert "<span>jobs played again</span><b>7</b>" in browser.get(f"/run/{key(folder)}").text
-
-
-def test_the_cluster_page_has_the_queue_by_priority_and_the_disks(tmp_path: Path) -> None:
-    waits, queued = {"a free slot": 1}, partial(QueuedJobs, env="gym/acrobot")
-    train = queued(priority="train", runs=2, waiting=5, leased=1, waits_for=waits)
-    queue = (train, queued(priority="hidden", runs=1, waiting=9, leased=0))
-    disk = DiskUse(database=3 << 30, free=20 << 30, total=80 << 30)
-    reply = status(open_status("r-1"), workers=(worker("w"),), queue=queue, disk=disk)
-    with client(site_of(tmp_path, cluster=reply)) as browser:
-        page = browser.get("/cluster").text
-    for text in ("1 for a free slot", "validation, held-out", "3.0 GiB", "20.0 GiB", "75 % used"):
-        assert text in page, text
-    assert page.index(">train<") < page.index(">validation, held-out, hidden evaluation<")
-    assert str(tmp_path.resolve()) in page, "the disk of the runs here"
-
-
-def test_every_end_has_a_counter_and_a_place_in_the_legend(tmp_path: Path) -> None:
-    ends = [("completed", None), ("cancelled", "stopped by its operator"), ("error", "no such model")]
-    for number, (end, error) in enumerate([*ends, ("error", "401"), ("no_ok_submit", None)]):
-        folder = finished_run(tmp_path, exp_id=f"e{number}")
-        record = json.loads((folder / "run.json").read_text())
-        record["outcome"] |= {"status": end, "error": error}
-        (folder / "run.json").write_text(json.dumps(record))
-    with client(site_of(tmp_path)) as browser:
-        page = browser.get("/").text
-    facts = re.findall(r"<li><span>([a-z ]+)</span><b>([^<]*)</b>", page)
-    assert facts[:4] == [
-        ("completed", "1 of 5"),
-        ("failed", "2"),
-        ("no working submit", "1"),
-        ("cancelled", "1"),
-    ]
-    legend = page.partition('<ul class="legend"')[2].partition("</ul>")[0]
-    words = re.findall(r"</span>([a-z ]+)</li>", legend)
-    assert words == ["completed", "no working submit", "failed", "cancelled"]
-    (row,) = [row for row in page.split("<tr") if "stopped by its operator</td>" in row]
-    assert row.index("cancelled") < row.index("stopped by its operator") < row.index("episodes used")
-
-
-def test_finished_run_without_ok_submit_waits_for_no_verdict(tmp_path: Path) -> None:
-    bad = Version(files={"policy.py": "import nope\n"}, returns=(0.0,), val=None, status="import_error")
-    folder = write_run(tmp_path, [bad])
-    with client(site_of(tmp_path)) as browser:
-        page = browser.get(f"/run/{key(folder)}").text
-    assert "No submit was ok." in page
-    assert "No submit has a verdict yet." not in page
-
-
-def test_charts_of_values_from_nought_have_no_negative_axis_and_a_title() -> None:
-    made = chart("Episodes a second", "hours", [Line("rate", [(-1.0, 0.0), (0.0, 0.0)])])
-    assert ">Episodes a second</text>" in made
-    assert [
-        text for text in re.findall(r'text-anchor="end" class="ink">([^<]*)<', made) if text.startswith("-")
-    ] == []
 
 
 def test_a_start_names_its_submit_and_links_to_its_parent(tmp_path: Path) -> None:
@@ -191,13 +115,3 @@ def test_a_runs_page_hides_its_selection_while_a_related_agent_may_live(tmp_path
     for page in (shown, hidden):
         assert page.count("best so far</b>") == 1
         assert "train mean <b>-100</b>" in page
-
-
-def test_an_agent_has_one_look_on_all_pages(tmp_path: Path) -> None:
-    folders = [finished_run(tmp_path, entry=entry) for entry in ("Agent A", "Agent B", "Agent C")]
-    with client(site_of(tmp_path)) as browser:
-        rows = browser.get("/").text.split("<tr")
-        for folder, entry in zip(folders, ("Agent A", "Agent B", "Agent C"), strict=True):
-            heading = browser.get(f"/run/{key(folder)}").text.partition("<h1")[2].partition("</h1>")[0]
-            (mark,) = re.findall(r'<path d="([^"]+)" fill="([^"]+)"', heading)
-            assert any(f">{entry}</a>" in row and f'd="{mark[0]}" fill="{mark[1]}"' in row for row in rows)

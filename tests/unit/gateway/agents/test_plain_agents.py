@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from evopolicy_gateway.agents.client import ProtocolError, Refusal, Verdict
-from evopolicy_gateway.agents.replay import play, policies_in, shares, stage
+from evopolicy_gateway.agents.replay import folder_for, play, policies_in, shares, stage
 from evopolicy_gateway.agents.uniform import POLICY
 from evopolicy_gateway.agents.uniform import play as play_uniform
 from evopolicy_worker.environments import compile_actions
@@ -151,3 +151,20 @@ def test_the_random_agent_spends_what_one_submit_may(tmp_path: Path) -> None:
     assert play_uniform(client, tmp_path)  # type: ignore[arg-type]
     assert client.asked == [[0, 1, 2, 0]]
     assert (tmp_path / "system" / "policy.py").read_text() == POLICY
+
+
+@pytest.mark.parametrize(
+    ("env", "names"),
+    [
+        ("gym/racing", ["", "gym_racing"]),
+        ("my_env:Glider-v0", ["", "my_env:Glider-v0", "my_env_Glider-v0"]),
+        ("gym/acrobot@w2", ["", "gym_acrobot", "gym_acrobot@w2"]),
+        ("gymnasium/MiniGrid-Empty-v0", ["", "gymnasium_MiniGrid", "gymnasium_MiniGrid-Empty-v0"]),
+    ],
+)
+def test_an_environment_is_played_by_the_policies_in_its_nearest_folder(
+    env: str, names: list[str], tmp_path: Path
+) -> None:
+    for name in names:  # each is preferred to the ones before it
+        (tmp_path / name).mkdir(exist_ok=True)
+        assert folder_for(tmp_path, env) == tmp_path / name

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import io
 from pathlib import Path
 from typing import Any
 
-import msgspec
 import pytest
 import typer
 from documents import parse
@@ -16,10 +14,8 @@ from invented.policies import Version
 from invented.run_dirs import write_run
 from rigs.finished_run import finished, plan_in
 
-from evopolicy_common.console import Terminal
 from evopolicy_common.errors import ConfigError, ProtocolError
 from evopolicy_common.messages.episode import LARGEST_LIMIT, LARGEST_LIMITS, ResourceLimits
-from evopolicy_common.messages.operator import RunProgress
 from evopolicy_common.messages.run_settings import PUBLISHED, off_profile
 from evopolicy_common.records.open_run import Rejected
 from evopolicy_common.records.run_record import decode_run_record, encode_run_record
@@ -29,7 +25,7 @@ from evopolicy_gateway.jail.settings import JailSettings
 from evopolicy_gateway.operator.cluster import Cluster
 from evopolicy_gateway.operator.trials import policy_bundle
 from evopolicy_gateway.processes import child_messages
-from evopolicy_gateway.processes.child_messages import AgentDoing, Progress
+from evopolicy_gateway.processes.child_messages import Progress
 from evopolicy_gateway.run.record import run_record
 from evopolicy_gateway.run.run_options import (
     ClusterOptions,
@@ -40,7 +36,6 @@ from evopolicy_gateway.run.run_options import (
     packages_for,
 )
 from evopolicy_gateway.run.times import Times
-from evopolicy_gateway.run.watch import RunView
 from evopolicy_gateway.run_folder.layout import Staged
 
 
@@ -227,42 +222,6 @@ def test_control_lines_come_back_as_they_were_and_nothing_else_does() -> None:
     for junk in (b"", b"{}", b'{"event": "other"}', b"plain text"):
         with pytest.raises(ProtocolError):
             child_messages.event_of(junk)
-
-
-def test_watchers_on_a_pipe_print_a_line_for_each_news() -> None:
-    out = io.StringIO()
-    with RunView(Terminal(file=out, width=200)).shown() as watch:
-        last: dict[str, Any] = {"last_submit_id": "submit_000", "last_status": "ok", "last_mean": -1.25}
-        progress = Progress(episode_budget=8, remaining_budget=4, n_submits=1, **last)
-        for _ in range(3):
-            watch.progress("toy/line", progress)
-        watch.progress("toy/line", msgspec.structs.replace(progress, waits_for="a worker"))
-        watch.doing("toy/line", AgentDoing(note="codex 99 is used"))
-        watch.doing("toy/line", AgentDoing(action="paused: usage limit", paused_s=60.0, provider="openai"))
-        watch.turn("toy/line", 1, "first line\nsecond")
-        for done in range(3):
-            watch.phase("toy/line", RunProgress(phase="heldout", done=done, total=3))
-    assert out.getvalue().splitlines() == [
-        "toy/line: submit_000 ok, mean return -1.25; 4 of 8 episodes left",
-        "toy/line: waiting for a worker",
-        "toy/line: codex 99 is used",
-        "toy/line: paused: usage limit (for 60 s)",
-        "toy/line: turn 1: first line",
-        "toy/line: held-out",
-    ]
-
-
-def test_watchers_on_a_terminal_draw_a_table() -> None:
-    out = io.StringIO()
-    console = Terminal(file=out, force_terminal=True, width=160)
-    with RunView(console).shown() as watch:
-        watch.note("toy/line", "run r-1")
-        now: dict[str, Any] = {"submit_id": "submit_001", "n_episodes": 4, "n_done": 1}
-        watch.progress("toy/line", Progress(episode_budget=8, remaining_budget=4, n_submits=2, **now))
-        watch.phase("toy/line", RunProgress(phase="validation", done=1, total=2))
-    text = out.getvalue()
-    for needed in ("run r-1", "4/8", "validating 1/2"):
-        assert needed in text
 
 
 OPEN = [("open-network", "bwrap"), ("none", "bwrap"), ("bwrap", "none")]

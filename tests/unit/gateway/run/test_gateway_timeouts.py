@@ -195,20 +195,6 @@ async def _sent(url: str, text: str) -> bytes:
         writer.close()
 
 
-def test_a_missing_body_is_refused_after_a_while(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(http, "BODY_WAIT_S", SOON_S)
-    monkeypatch.setattr(http, "LINGER", (1 << 20, SOON_S))
-
-    async def main() -> bytes:
-        async with served(tmp_path) as s:
-            head = "POST PATH HTTP/1.1\r\nhost: x\r\nconnection: close\r\ncontent-length: 100\r\n\r\n{"
-            return await _sent(s.urls.submit, head)
-
-    answer = asyncio.run(main())
-    assert answer.startswith(b"HTTP/1.1 400")
-    assert b"did not arrive" in answer
-
-
 def test_a_body_of_a_stranger_is_not_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(http, "STRANGER_LINGER", (1 << 20, SOON_S))
     received: list[dict[str, Any]] = []

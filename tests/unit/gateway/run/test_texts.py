@@ -14,7 +14,7 @@ from evopolicy_gateway.harnesses.coding_agents.llm import listed_prices, prices_
 from evopolicy_gateway.harnesses.interface.agent_config import AgentConfig, ApiTable
 from evopolicy_gateway.relay.usage import Prices
 from evopolicy_gateway.run.texts import Texts, read, read_prices
-from evopolicy_gateway.workspace.prompts import FIRST, NEXT_TURN, STANDARD, Prompts
+from evopolicy_gateway.workspace.prompts import FIRST, NEXT_TURN, Prompts
 
 
 def test_without_files_the_texts_are_the_standard_ones_and_have_no_digest(tmp_path: Path) -> None:
@@ -44,15 +44,6 @@ def test_an_agent_files_prompts_count_unless_the_run_has_some(tmp_path: Path) ->
     # A digest depends on the texts, not on where they stand.
     (tmp_path / "q.toml").write_text("# a comment\nfirst = 'hers'\n")
     assert read(None, "q.toml", None, tmp_path).digests == read(None, None, config, tmp_path).digests
-
-
-def test_the_printed_prompts_are_the_standard_ones() -> None:
-    printed = Prompts(**STANDARD)
-    assert (printed.begin(), printed.stopped(4), printed.resumed(4)) == (
-        Prompts().begin(),
-        Prompts().stopped(4),
-        Prompts().resumed(4),
-    )
 
 
 @pytest.mark.parametrize(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import random
 from pathlib import Path
 
@@ -14,10 +13,8 @@ from stages.sweep_stage import entry_of
 
 from evopolicy_common import catalogue
 from evopolicy_common.catalogue import worlds
-from evopolicy_common.console import Terminal
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.records.suite_folder import Index
-from evopolicy_gateway.processes.child_messages import AgentDoing, Progress
 from evopolicy_gateway.run.plan import Plan
 from evopolicy_gateway.suite import suite_index
 from evopolicy_gateway.suite.decisions import (
@@ -31,7 +28,6 @@ from evopolicy_gateway.suite.decisions import (
 )
 from evopolicy_gateway.suite.suite_file import check_agents_start, expand, read
 from evopolicy_gateway.suite.suite_index import used
-from evopolicy_gateway.suite.suite_view import SuiteView
 
 FILE = """
 name = "s"
@@ -304,42 +300,6 @@ def test_a_sweeps_use_adds_up_over_its_runs(tmp_path: Path) -> None:
         three.name: entry_of(three),
     }
     assert used(Index(suite="s", runs=runs)) == (20, 0.5, 7)
-
-
-def test_the_live_table_shows_each_run_and_the_totals(tmp_path: Path) -> None:
-    runs = suite_in(tmp_path)
-    out = io.StringIO()
-    console = Terminal(file=out, width=160)
-    view = SuiteView([run.name for run in runs], 2, console)
-    first, second, third, failed = runs[:4]
-    known = entry_of(first, state="completed", score=-1.25, wall_s=60.0, finished_at="2026-01-01T00:00:00Z")
-    view.kept(first.name, known)
-    later = {
-        "score": 2.5,
-        "random": 0.5,
-        "budget_used": 7,
-        "n_submits": 3,
-        "finished_at": "2026-01-02T00:00:00Z",
-    }
-    view.finished(third.name, entry_of(third, state="completed", wall_s=60.0, **later))
-    view.finished(failed.name, entry_of(failed, state="error", error="no key"))
-    view.started(second.name, 1)
-    view.progress(second.name, Progress(episode_budget=16, remaining_budget=10, n_submits=2, best_mean=-3.5))
-    tokens = {"input_noncached": 1000, "cache_read": 500, "output": 0}
-    view.doing(second.name, AgentDoing(action="$ curl /submit", tokens=tokens))
-    console.print(view.render())
-    text = out.getvalue()
-    assert "6/16" in text
-    assert "-3.5" in text
-    assert "1.5k" in text
-    assert "$ curl /submit" in text
-    assert "score -1.25" in text
-    assert "2 of 7 runs done, 1 running, 1 failed, 1.5k tokens, about 2 min left" in text
-    # Running, failed, waiting and ended runs: of these the last first.
-    rows = [line for line in text.splitlines() if line.startswith(("evolve/", "GPT/")) and ":" not in line]
-    names = [line.split()[0] for line in rows]
-    assert names == [second.name, failed.name, *(run.name for run in runs[4:]), third.name, first.name]
-    assert rows[-2].split()[1:] == ["7", "3", "score", "2.5", "(random", "0.5)"]
 
 
 PLACES = st.tuples(st.sampled_from("abcd"), st.sampled_from(["shared", "per_run"]))

@@ -20,7 +20,7 @@ from evopolicy_gateway.http.service import info_document
 from evopolicy_gateway.http.task import task_markdown
 from evopolicy_gateway.run_folder.layout import RunFolder, run_folder
 from evopolicy_gateway.submits.tickets import TicketMachine
-from evopolicy_gateway.workspace.agents_md import NO_URLS, PLACEHOLDERS, STANDARD, agents_md, urls_below
+from evopolicy_gateway.workspace.agents_md import NO_URLS, PLACEHOLDERS, agents_md, urls_below
 from evopolicy_gateway.workspace.prompts import check_text
 from evopolicy_gateway.workspace.staging import constant_action, initial_policy, stage
 
@@ -82,11 +82,6 @@ def test_the_first_policy_runs_and_returns_a_valid_action(space: dict[str, Any],
     assert policy.act(np.zeros(3)) == action
 
 
-def test_the_first_policy_of_a_long_action_stays_readable() -> None:
-    space = {"type": "Box", "shape": [40], "dtype": "float32", "min": -1.0, "max": 1.0}
-    assert max(map(len, initial_policy(space).splitlines())) < 120
-
-
 def test_the_rules_name_every_file_verdict_and_bound() -> None:
     text = agents_md(opened(episode_budget=128, max_episodes_per_submit=500, min_episodes_per_submit=4), URLS)
     for needed in (
@@ -134,10 +129,6 @@ def test_an_operators_text_replaces_or_extends_the_rules(tmp_path: Path) -> None
     written = (tmp_path / "run/workspace/AGENTS.md").read_text()
     assert written == f"Budget 12, $5.\n\n{agents_md(opened(), URLS)}\nSubmit to {URLS.submit}."
     assert staged.agents_md_hash != stage(folder_at(tmp_path / "b"), opened(), URLS).agents_md_hash
-
-
-def test_the_printed_standard_text_gives_the_same_rules() -> None:
-    assert agents_md(opened(), URLS, STANDARD) == agents_md(opened(), URLS)
 
 
 @pytest.mark.parametrize(
