@@ -147,7 +147,7 @@ def chaos(seconds: float, seed: int, root: Path, tell: Tell) -> bool:
     semaphores = _semaphores()
     wrong: list[str] = []
     with fault_cluster(root, workers=2) as cluster:
-        twins = _Twins(cluster)
+        twins = Twins(cluster)
         twins.play("undisturbed", None, wrong)
         if wrong:
             tell("\n".join(wrong))
@@ -194,7 +194,7 @@ def chaos(seconds: float, seed: int, root: Path, tell: Tell) -> bool:
     return not wrong
 
 
-class _Twins:
+class Twins:
     """A single run and a sweep at the same time, again and again."""
 
     def __init__(self, cluster: FaultCluster) -> None:

@@ -21,6 +21,7 @@ import signal
 import subprocess
 import sys
 import tempfile
+import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, field
@@ -55,6 +56,8 @@ JUMPS_H = {"5 h forward": 5, "5 h back": -5, "5 h back, all restarted": -5, "1 h
 LEAD_LOST_S = 25.0
 """Longer than a paused leader has the lock of the database."""
 DATABASE_GONE_S = 2.0
+LEADS_S = 5.0
+"""How long each leader of a sweep leads."""
 DISK_ERRORS = {"over quota": errno.EDQUOT, "read-only": errno.EROFS, "input/output error": errno.EIO}
 TARGETS = ("coordinator", "worker", "slot", "zygote", "gateway", "supervisor", "run")
 ONE_HOST = (
@@ -93,6 +96,7 @@ FAULTS: dict[Site, tuple[tuple[str, str], ...]] = {
     "two coordinators": (
         ("leader", "SIGKILL"),
         ("leader", "SIGSTOP past its lead"),
+        ("leader", "SIGKILL again and again under a sweep"),
         ("database", "SIGKILL"),
     ),
     "bad disks": tuple(
@@ -435,6 +439,34 @@ def play_restored(cluster: FaultCluster, name: str, case: Case) -> Row:
     return row
 
 
+def play_sweep(cluster: FaultCluster, name: str, case: Case) -> Row:
+    """A run and a sweep at once, whose leader is killed as soon as it has led for `LEADS_S` and another one waits."""
+    started, ended = time.monotonic(), threading.Event()
+    row, twins, kills = (
+        Row(case.target, case.fault, case.seed, 0, phase="again and again"),
+        chaos.Twins(cluster),
+        0,
+    )
+
+    def killing() -> None:
+        nonlocal kills
+        while not ended.wait(LEADS_S):
+            kill(cluster.find("leader"))
+            kills += 1
+
+    if not (cluster.runs / "undisturbed").exists():
+        twins.play("undisturbed", None, row.wrong)
+    thread = threading.Thread(target=killing)
+    thread.start()
+    try:
+        twins.play(name, None, row.wrong)
+    finally:
+        ended.set()
+        thread.join()
+    row.struck, row.took_s = kills > 0, round(time.monotonic() - started, 1)
+    return row
+
+
 def play_at(cluster: FaultCluster, site: Site, wanted: list[Case], on_row: Callable[[Row], None]) -> bool:
     first = play(cluster, "undisturbed")
     first.fault = site
@@ -446,6 +478,8 @@ def play_at(cluster: FaultCluster, site: Site, wanted: list[Case], on_row: Calla
         name = f"run-{number}"
         if case.fault.startswith("backup"):
             row = play_restored(cluster, name, case)
+        elif case.fault.endswith("under a sweep"):
+            row = play_sweep(cluster, name, case)
         else:
             row = play(cluster, name, case)
             check(cluster, row, cluster.folder(name), undisturbed)
