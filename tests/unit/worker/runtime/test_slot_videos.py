@@ -15,7 +15,7 @@ from evopolicy_common.messages.episode import EpisodeOutcome
 from evopolicy_worker import environments
 from evopolicy_worker.episodes.video import MAX_FAILURES, VideoRecorder
 
-ENVIRONMENTS = ["toy/line", "toy/maze", "gymnasium/MiniGrid-FourRooms-v0", "gymnasium/roundabout-v0"]
+ENVIRONMENTS = ["toy/line", "gymnasium/MiniGrid-FourRooms-v0"]
 if ctypes.util.find_library("EGL"):
     ENVIRONMENTS.append("gymnasium/FetchPickAndPlace-v4")
 
