@@ -6,7 +6,6 @@ import csv
 import io
 import json
 from pathlib import Path
-from xml.etree import ElementTree
 
 import pytest
 from invented.policies import Version, png, policy
@@ -18,8 +17,6 @@ from evopolicy_results.behaviour.trace import trace
 from evopolicy_results.figures.plot import inline_svg
 from evopolicy_results.figures.policies import wilson
 from evopolicy_results.figures.style import new_figure, svg_text
-from evopolicy_results.figures.timelines import MAX_ROWS
-from evopolicy_results.notebook import figures_of
 from evopolicy_results.reading.agent_log import read_agent_log
 from evopolicy_results.reading.reader import read_run
 from evopolicy_results.studies.study import study
@@ -120,27 +117,6 @@ def test_inline_svg_is_themed_named_and_has_ids_of_its_own() -> None:
     assert not ids[0] & ids[1]
 
 
-def test_timelines_have_a_row_for_each_run_up_to_their_limit(tmp_path: Path) -> None:
-    versions = [Version(policy(gain=float(i)), (0.0,) * 4, 1.0 + i % 2) for i in range(3)]
-    for repeat in range(MAX_ROWS + 2):
-        write_run(tmp_path, versions, entry="<A & B>", repeat=repeat, budget=16)
-    (plot,) = [each for each in figures_of(study([tmp_path])) if each.name.startswith("timeline_")]
-    svg = ElementTree.fromstring(plot.svg)
-    texts = [element.text or "" for element in svg.iter("{http://www.w3.org/2000/svg}text")]
-    assert (
-        sum(text.startswith("<A & B>") for text in texts)
-        == sum(text == "best 2" for text in texts)
-        == MAX_ROWS
-    )
-    marks = [
-        element.get("href") for element in svg.iter("{http://www.w3.org/2000/svg}use") if element.get("x")
-    ]
-    assert (marks.count("#hit"), marks.count("#miss")) == (2 * MAX_ROWS, MAX_ROWS)
-    assert {"first policy", "parametric edits", "does not"} <= set(texts)
-    assert "rollback" not in texts
-    assert "2 more runs have their timelines on their own pages." in plot.caption
-
-
 VERSIONS = [
     Version(policy(gain=1.0), (0.0,) * 4, 1.0, says="I start simple."),
     Version(policy(gain=2.0), (0.0,) * 4, 2.0, says="It is too slow.", images={"probe.png": png()}),
@@ -211,22 +187,6 @@ def test_damaged_or_strange_log_lines_are_passed_over(tmp_path: Path) -> None:
     log.write_bytes(b"\n".join(strange))
     assert read_agent_log(log, run.submits).unplaced == ("hello",)
     assert read_agent_log(tmp_path / "absent", run.submits).unplaced == ()
-
-
-def test_many_repeats_are_drawn_as_mean_and_range(tmp_path: Path) -> None:
-    for repeat in range(5):
-        versions = [
-            Version(policy(gain=1.0), (0.0,) * (4 + repeat), float(repeat)),
-            Version(policy(gain=2.0), (0.0,) * 4, 9.0),
-        ]
-        write_run(tmp_path, versions, repeat=repeat, budget=16)
-    plots = {plot.name: plot for plot in figures_of(study([tmp_path]))}
-    panel = plots["score_evolution_core16"].figure.axes[0]
-    (band,) = panel.collections
-    (line,) = [line for line in panel.lines if len(line.get_xdata()) > 2]
-    assert line.get_xdata()[0] == 8  # where the last run got its first score
-    assert line.get_ydata()[-1] == 9.0
-    assert band.get_datalim(panel.transData).ymax == 9.0
 
 
 def test_foreign_environments_have_their_runs_titles_and_families(tmp_path: Path) -> None:

@@ -64,14 +64,6 @@ def test_what_is_checked_leaves_nothing_behind(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_fault_and_its_remedy_are_two_clauses(tmp_path: Path) -> None:
-    (tmp_path / "file").touch()
-    with pytest.raises(
-        ConfigError, match=r"a part of the path is no folder; if this cannot be changed, choose .*--runs$"
-    ):
-        check_writable(tmp_path / "file" / "runs", "--runs")
-
-
 def test_a_path_that_is_not_utf8_is_reported_printably(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"odd-\\xff: this path is not UTF-8; choose another with --state"):
         check_text(Path(os.fsdecode(b"/odd-\xff")), "--state")

@@ -23,15 +23,6 @@ def state(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path / "state"
 
 
-def test_init_tells_the_next_two_commands(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    state = tmp_path / "state"
-    certs_cli.init(state=state, host=["lab.example", "10.0.0.5"])
-    output = capsys.readouterr().out
-    assert f"evopolicy-coordinator --listen tls/0.0.0.0:7447 --state {state}" in output
-    assert f"certs issue worker NAME --state {state}" in output
-    assert "lab.example, 10.0.0.5, localhost, 127.0.0.1, ::1" in output
-
-
 def contents(state: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in (state / "certs").iterdir()}
 

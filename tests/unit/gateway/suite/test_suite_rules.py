@@ -12,7 +12,6 @@ from hypothesis import strategies as st
 from stages.sweep_stage import entry_of
 
 from evopolicy_common import catalogue
-from evopolicy_common.catalogue import worlds
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.records.suite_folder import Index
 from evopolicy_gateway.run.plan import Plan
@@ -158,21 +157,6 @@ def test_shipped_suites_are_whole(name: str, tmp_path: Path, monkeypatch: pytest
         assert {run.settings.observations for run in runs} == {"lists" if paper else "arrays"}
     profiles = {(run.settings.profile, run.settings.finish) for run in runs}
     assert profiles == {("published", "budget") if "published" in name else ("own", "early")}
-
-
-def test_the_shipped_suite_of_all_families_has_small_numbers(tmp_path: Path) -> None:
-    runs = expand(read("breadth.toml"), tmp_path, tmp_path)
-    assert {run.settings.env for run in runs} == set(catalogue.suites()["breadth"].environments)
-    (numbers,) = {(run.settings.budget, run.settings.n_validation, run.settings.n_heldout) for run in runs}
-    assert numbers == (32, 8, 16)
-
-
-def test_the_shipped_controls_play_environments_and_their_worlds(tmp_path: Path) -> None:
-    runs = expand(read("world-controls.toml"), Path(__file__).parents[4], tmp_path)
-    envs = {run.settings.env for run in runs}
-    bases = {worlds.unchanged(env) for env in envs}
-    assert envs == {each for base in bases for each in (base, *worlds.ids(base))}
-    assert len(runs) == 3 * len(envs) == 48
 
 
 def test_a_file_that_contradicts_its_profile_is_refused(tmp_path: Path) -> None:

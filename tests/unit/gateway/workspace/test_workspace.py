@@ -101,28 +101,6 @@ def test_the_rules_name_every_file_verdict_and_bound() -> None:
     assert not re.search(r"\$[a-z_]+", text)
 
 
-PICTURES = msgspec.structs.replace(LINE, obs_storage="npz")
-
-
-@pytest.mark.parametrize(
-    ("detail", "env", "named", "left_out"),
-    [
-        ("scores", LINE, ["step and category"], ["trajectory.jsonl", "stdout.txt", "video.mp4", "traceback"]),
-        ("trajectories", LINE, ["trajectory.jsonl", "stdout.txt"], ["video.mp4", "observations.npz"]),
-        ("trajectories", PICTURES, ["trajectory.jsonl", "no pictures"], ["stdout.txt", "observations.npz"]),
-        ("pictures", PICTURES, ["observations.npz", "stdout.txt", "video.mp4"], ["no pictures"]),
-    ],
-)
-def test_the_rules_name_the_files_of_their_level_of_feedback(
-    detail: str, env: Any, named: list[str], left_out: list[str]
-) -> None:
-    run = opened(env, feedback=detail)
-    text = agents_md(run, URLS)
-    assert all(name in text for name in named)
-    assert not any(name in text for name in left_out)
-    assert ("trajectory.jsonl" in task_markdown(run)) == (detail != "scores")
-
-
 def test_an_operators_text_replaces_or_extends_the_rules(tmp_path: Path) -> None:
     text = "Budget $budget, $$5.\n\n$standard\nSubmit to $submit_url."
     staged = stage(folder_at(tmp_path), opened(), URLS, text)
