@@ -38,7 +38,7 @@ class Bug:
     old: str
     new: str
     seed: int = 0
-    """To try first, for a bug that few seeds detect. After a change of the core other seeds may detect it."""
+    """The first that detects it, to try before the others. After a change of the core it may be another one."""
 
 
 @contextmanager
@@ -102,8 +102,8 @@ BUGS = (
         "False and not",
         seed=1037,
     ),
-    Bug("forget to queue after a back-off", queue, "backed_off", "if job is not None", "if False"),
-    Bug("forget the adoption timer", loading, "load", "if state.adopting:", "if False:"),
+    Bug("forget to queue after a back-off", queue, "backed_off", "if job is not None", "if False", seed=10),
+    Bug("forget the adoption timer", loading, "load", "if state.adopting:", "if False:", seed=5),
     Bug("forget the worker's timer", expiry, "check_due", "if deadlines:", "if False:"),
     Bug(
         "skip the fencing",
@@ -111,11 +111,12 @@ BUGS = (
         "take",
         "live = lease is not None and lease.live and job.lease is lease",
         "live = True",
+        seed=13,
     ),
-    Bug("count late limit verdicts", results, "_done", "if silent and", "if False and", seed=332),
+    Bug("count late limit verdicts", results, "_done", "if silent and", "if False and", seed=49),
     Bug("keep a job open when it is done", results, "_commit", "groups.close_job(state, job, step)", "pass"),
     Bug("answer for outcomes that were not stored", results, "_commit", "step.persist(row)", "pass"),
-    Bug("count attempts from one after a restart", State, "__init__", "(incarnation - 1) *", "0 *"),
+    Bug("count attempts from one after a restart", State, "__init__", "(incarnation - 1) *", "0 *", seed=13),
     Bug(
         "show episodes before the gate",
         result_polls,
@@ -130,7 +131,7 @@ BUGS = (
         "select",
         "best_validated(means, run.row.settings.profile)",
         "max(means, key=lambda index: (means[index], -index), default=None)",
-        seed=68,
+        seed=34,
     ),
     Bug("select before all are validated", finalisation, "advance", "if waiting:", "if False:"),
     Bug(
@@ -142,8 +143,8 @@ BUGS = (
         seed=49,
     ),
     Bug("take a second submit while one runs", submits, "submit", "if run.open is not None:", "if False:"),
-    Bug("take submits of a closed run", submits, "submit", 'run.state.phase != "open"', "False", seed=47),
-    Bug("accept the same key twice", submits, "submit", "known is not None", "False"),
+    Bug("take submits of a closed run", submits, "submit", 'run.state.phase != "open"', "False", seed=22),
+    Bug("accept the same key twice", submits, "submit", "known is not None", "False", seed=8),
     Bug(
         "lease to a poll that was given up unread",
         scheduler,
@@ -153,7 +154,12 @@ BUGS = (
         seed=150,
     ),
     Bug(
-        "leave runs unpinned when a lost worker is back", membership, "worker_of", "if was_lost:", "if False:"
+        "leave runs unpinned when a lost worker is back",
+        membership,
+        "worker_of",
+        "if was_lost:",
+        "if False:",
+        seed=23,
     ),
     Bug(
         "leave runs unpinned when a worker is taken back",
@@ -163,14 +169,14 @@ BUGS = (
         "pass",
         seed=15,
     ),
-    Bug("let a lease expire under heartbeats", leases, "hear", "lease.renewed = now", "pass"),
+    Bug("let a lease expire under heartbeats", leases, "hear", "lease.renewed = now", "pass", seed=1),
     Bug(
         "take a liveliness hint for the truth",
         membership,
         "liveness_lost",
         "worker.doubted_at = step.now",
         "__import__('evopolicy_coordinator.core.leasing.expiry', fromlist=['lose']).lose(state, worker, step)",
-        seed=14,
+        seed=20,
     ),
     Bug(
         "expire leases after the loop stood still",
@@ -178,7 +184,7 @@ BUGS = (
         "_watch",
         "now - due > state.settings.late_s",
         "False",
-        seed=121,
+        seed=150,
     ),
     Bug(
         "play what is done again after a restart",
@@ -186,6 +192,7 @@ BUGS = (
         "open_group",
         "loading.heads.pop(group.id, [])",
         "[]",
+        seed=5,
     ),
     Bug(
         "forget after a restart who is out of service",
@@ -193,9 +200,10 @@ BUGS = (
         "count_in",
         'state.out_of_service.get(worker.name, "active")',
         '"active"',
+        seed=13,
     ),
     Bug("mix fingerprint classes", Profile, "serves", "and fingerprint_class == self.classes[env]", ""),
-    Bug("adopt a job that is leased elsewhere", leases, "_adopt", "or job.lease is not None", "", seed=60),
+    Bug("adopt a job that is leased elsewhere", leases, "_adopt", "or job.lease is not None", "", seed=46),
     Bug("forget to tell a worker to stop", leases, "hear", "stop.append(item.lease_id)", "pass", seed=13),
     Bug(
         "leave a lost worker's leases with it",
@@ -205,7 +213,14 @@ BUGS = (
         "[]",
         seed=26,
     ),
-    Bug("refuse a worker that comes back", fleet, "of_session", 'if worker.state == "lost":', "if False:"),
+    Bug(
+        "refuse a worker that comes back",
+        fleet,
+        "of_session",
+        'if worker.state == "lost":',
+        "if False:",
+        seed=23,
+    ),
     Bug(
         "play hidden episodes beside an agent",
         conflicts,
@@ -219,6 +234,7 @@ BUGS = (
         "hidden_conflict",
         "if related(kernel.train, case_set) or related(state.everywhere.train, case_set):",
         "if False:",
+        seed=5,
     ),
     Bug(
         "play train episodes beside hidden ones",
@@ -234,6 +250,7 @@ BUGS = (
         "hidden_conflict",
         "if kernel is state.everywhere:",
         "if False:",
+        seed=29,
     ),
     Bug(
         "take an agent that may be anywhere for one that is nowhere",
@@ -241,9 +258,10 @@ BUGS = (
         "permits_there",
         "or related(state.everywhere.permits, case_set)",
         "",
+        seed=1,
     ),
     Bug("take siblings for strangers", CaseSets, "join", "(env, case.seed,", "(len(self._known), case.seed,"),
-    Bug("forget permits at a restart", permits, "load", "row.ended_at is not None", "True", seed=13),
+    Bug("forget permits at a restart", permits, "load", "row.ended_at is not None", "True", seed=34),
     Bug("forget what a silent worker may still play", occupancies, "vacate", "if sure:", "if True:", seed=19),
     Bug(
         "take all kernels for free after a restart",
@@ -251,7 +269,7 @@ BUGS = (
         "load",
         "for hidden in (True, False):",
         "for hidden in ():",
-        seed=107,
+        seed=44,
     ),
     Bug("keep a closed run's permit", finalisation, "close", "permits.end(", "(lambda *_: None)("),
     Bug(
@@ -261,15 +279,18 @@ BUGS = (
         "and not permits_there(state, kernel, case_set)",
         "",
     ),
-    Bug("keep what was handed back in memory only", results, "_keep_begun", "step.persist(", "str("),
+    Bug("keep what was handed back in memory only", results, "_keep_begun", "step.persist(", "str(", seed=19),
     Bug(
         "drop what was handed back",
         results,
         "_keep_begun",
         "job.begun, job.begun_attempt = result.begun, result.attempt",
         "job.begun_attempt = result.attempt",
+        seed=19,
     ),
-    Bug("forget at a restart what was handed back", loading, "load", "loading.begun.update(", "dict("),
+    Bug(
+        "forget at a restart what was handed back", loading, "load", "loading.begun.update(", "dict(", seed=38
+    ),
     Bug(
         "end others' permits when a gateway names another kernel of their machine",
         requests,
@@ -279,7 +300,7 @@ BUGS = (
         " [permits._end(state, there, row, step, '') for each in list(state.permits)"
         " for there, row in permits.held(state, each)"
         " if row.host == message.host and row.boot_id != message.boot_id]",
-        seed=9,
+        seed=145,
     ),
     Bug(
         "end permits when a worker names another kernel of their machine",
@@ -307,7 +328,7 @@ BUGS = (
         "_end_overdue",
         ">= state.settings.agent_wait_s",
         ">= 0.0",
-        seed=9,
+        seed=0,
     ),
     Bug(
         "let an agent start before hidden episodes have ended",
@@ -315,6 +336,7 @@ BUGS = (
         "permit_conflict",
         "if not occupancies:",
         "if not any(occupancy.lease is not None and occupancy.lease.live for occupancy in occupancies):",
+        seed=19,
     ),
     Bug(
         "never reserve a kernel",
@@ -322,6 +344,7 @@ BUGS = (
         "_kept",
         "flow.kept_s >= state.settings.hidden_wait_s",
         "False",
+        seed=2,
     ),
     Bug(
         "never release a reserved kernel",
@@ -329,6 +352,7 @@ BUGS = (
         "check_due",
         "if not any(flow.n_hidden and flow.lane is lane for flow in reservation.flows):",
         "if False:",
+        seed=2,
     ),
     Bug(
         "let later hidden episodes prolong a reservation",
@@ -344,7 +368,7 @@ BUGS = (
         "_kept",
         "_end_overdue(state, reservation, step)",
         "pass",
-        seed=25,
+        seed=113,
     ),
     Bug(
         "believe in kernels on which nobody works",

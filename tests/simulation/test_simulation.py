@@ -30,14 +30,7 @@ def test_every_seed_ends_as_it_does_without_faults(first: int) -> None:
             raise AssertionError(f"seed {seed}: {error}\nreplay: {replay_command(seed)}") from error
 
 
-SLOW = ("expire leases after the loop stood still",)
-"""Bugs that need many seeds."""
-
-
-@pytest.mark.parametrize(
-    "bug",
-    [pytest.param(bug, id=bug.title, marks=[pytest.mark.system] * (bug.title in SLOW)) for bug in BUGS],
-)
+@pytest.mark.parametrize("bug", [pytest.param(bug, id=bug.title) for bug in BUGS])
 def test_a_planted_bug_is_caught(bug: Bug) -> None:
     with planted(bug):
         for seed in (bug.seed, *range(SEEDS_PER_BUG)):
