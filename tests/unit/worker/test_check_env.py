@@ -15,7 +15,7 @@ import pytest
 
 from evopolicy_common import catalogue
 from evopolicy_common.catalogue import Entry
-from evopolicy_worker.check_env import COLUMNS, MOST_MEMORY_MB, TIMES, Checked, InASlot, bare_loop, page, span
+from evopolicy_worker.check_env import COLUMNS, MOST_MEMORY_MB, TIMES, Checked, InASlot, bare_loop, page
 from evopolicy_worker.environments.checks import conformance
 from evopolicy_worker.environments.checks.conformance import CheckResult
 
@@ -62,23 +62,6 @@ def test_a_page_keeps_the_rows_of_environments_that_were_not_played_again(tmp_pa
         if line.startswith("| `")
     }
     assert rows == {CARTPOLE: "7", PENDULUM: "600"}
-
-
-def test_a_page_shows_times_of_measured_environments_with_their_range(tmp_path: Path) -> None:
-    results = tmp_path / "results.jsonl"
-    played = checked(CARTPOLE)
-    measured = msgspec.structs.replace(played, slot=InASlot(bare_us=8.5, slot_us=1250.4, busy=True))
-    results.write_bytes(
-        msgspec.json.encode(measured) + b"\n" + msgspec.json.encode(checked(PENDULUM)) + b"\n"
-    )
-    _, _, times = page(results, f"| `{PENDULUM}` | 9 | |", [CARTPOLE, PENDULUM]).partition("measured for ")
-    assert times.startswith("1 of 2:")
-    assert [line for line in times.splitlines() if line.startswith(("| `", "| minimum"))] == [
-        f"| `{CARTPOLE}` | 8.5* | 1,250* |",
-        "| minimum, median, maximum | 8.5* | 1,250* |",
-    ]
-    assert span(["1,000", "", "3,000", "2,500"], per=1000) == "1, 2.5, 3"
-    assert span(["", ""]) == "-"
 
 
 def test_the_bare_loop_plays_the_same_stretch_at_each_turn() -> None:

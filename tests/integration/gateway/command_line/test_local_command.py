@@ -58,16 +58,6 @@ def test_local_plays_a_whole_run_and_leaves_nothing_behind(tmp_path: Path) -> No
         assert json.loads(line)["event"]
 
 
-def test_video_all_leaves_a_video_beside_each_trajectory(tmp_path: Path) -> None:
-    small = ["--budget", "2", "--validation", "1", "--heldout", "1"]
-    arguments = ["local", "--env", "toy/line", "--agent", "random", "--exp-id", "t", "--video", "all", *small]
-    ended(tmp_path, *arguments)
-    episodes = [path.parent for path in (run_dir(tmp_path) / "workspace").rglob("trajectory.jsonl")]
-    assert episodes
-    for folder in episodes:
-        assert (folder / "video.mp4").read_bytes()[4:8] == b"ftyp"
-
-
 @pytest.mark.parametrize(
     "jail", ["--jail none", "--jail open-network --jail-env http_proxy", "--jail-env http_proxy"]
 )

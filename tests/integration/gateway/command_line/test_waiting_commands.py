@@ -108,16 +108,6 @@ def test_a_run_whose_workers_are_paused_says_so_and_so_does_status(paused: Path,
     assert record_in(run_dir(tmp_path)).outcome.status == "completed"
 
 
-def test_a_trial_whose_workers_are_paused_says_so(paused: Path, tmp_path: Path, policy: str) -> None:
-    more = ("--env", "toy/line", "--json", "--credentials", str(paused))
-    with command(tmp_path, "try", policy, "--cases", "0", *more) as running:
-        wait_until(lambda: WORKER_IS_PAUSED in running.err, lambda: running.text)
-        resume(paused, tmp_path)
-        code, out, err = running.finish()
-    assert code == 0, err
-    assert json.loads(out)
-
-
 @pytest.mark.parametrize("name", ["status", "run", "try"])
 def test_a_command_without_coordinator_says_what_it_awaits(tmp_path: Path, policy: str, name: str) -> None:
     arguments = {

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import json
-import re
 import sys
 from pathlib import Path
 
@@ -186,28 +185,6 @@ WRONG += ["command:no-such-program-x", "command:python3 no_such_script.py", "com
 def test_a_text_that_is_no_agent_is_refused_with_the_forms(agent: str, tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="--agent"):
         make(agent, tmp_path)
-
-
-@pytest.mark.parametrize(
-    ("agent", "meant"),
-    [
-        ("claude", "claude-code"),
-        ("claude:opus", "claude-code:opus"),
-        ("Codex", "codex"),
-        ("evolve:x", "evolve"),
-        ("replay", "replay:DIR"),
-        ("gpt-5.5", "llm:openai/gpt-5.5"),
-        ("claude-opus-4-5", "llm:anthropic/claude-opus-4-5"),
-        ("openai/own", "llm:openai/own"),
-        ("comand:python3 a.py", "'command:python3 a.py'"),
-    ],
-)
-def test_a_wrong_agent_is_answered_with_the_nearest_one(agent: str, meant: str, tmp_path: Path) -> None:
-    with pytest.raises(
-        ConfigError, match=re.escape(f"write --agent {meant}, or one of these forms:")
-    ) as raised:
-        make(agent, tmp_path)
-    assert len(raised.value.__notes__) == 2
 
 
 def test_a_replay_without_policies_is_refused_before_a_run_is_opened(tmp_path: Path) -> None:
