@@ -9,6 +9,7 @@ docs/reference/environments.md.
 from __future__ import annotations
 
 import hashlib
+import math
 import subprocess
 import sys
 from pathlib import Path
@@ -90,8 +91,13 @@ def table() -> str:
     """The table of all anchors, as Markdown."""
 
     def cell(one: Measured) -> str:
-        interval = "" if one.low is None else f" ({one.low:.4g} to {one.high:.4g})"
-        return f"{one.mean:.4g}{interval}"
+        if one.low is None or one.high is None:
+            return f"{one.mean:.4g}"
+        half = (one.high - one.low) / 2
+        if abs(one.mean - one.low - half) > half / 100:
+            return f"{one.mean:.4g} ({one.low:.4g} to {one.high:.4g})"
+        digits = max(0, 1 - math.floor(math.log10(half)))
+        return f"{one.mean:.{digits}f} ± {half:.{digits}f}"
 
     lines = ["| environment | random (95 % interval) | best known (95 % interval) |", "|---|---|---|"]
     for env_id, each in anchors.anchors().items():

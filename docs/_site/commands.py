@@ -24,10 +24,12 @@ OF_A_RUN = {
     *(one.flag for each in (RunOptions, JailSettings, ListenerOptions) for one in declared(each).values()),
 }
 """Options that `options.md` describes."""
+TYPER = ("help", "install_completion", "show_completion")
+"""Options that typer adds."""
 
 
 def page() -> str:
-    """The page's Markdown. A row that three commands or more have is in one table at its start, one for each option."""
+    """The page's Markdown. A row that several commands have is in one list at its start, one for each option."""
     apps = {"": front, "-coordinator": coordinator, "-worker": worker, "-gateway": gateway}
     trees = {f"evopolicy{name}": typer.main.get_command(app) for name, app in apps.items()}
     found = [each for name, command in trees.items() for each in _commands(name, command, 2)]
@@ -37,10 +39,11 @@ def page() -> str:
         for each in _options(command)
         if not _of_a_run(command, each)
     )
-    shared = {name: row for (name, row), times in reversed(rows.most_common()) if times > 2}.values()
+    shared = {name: row for (name, row), times in reversed(rows.most_common()) if times > 1}.values()
     parts = [
         "# Commands\n\nEvery command has `--help` with an example. `evopolicy run`, `local`, and `suite` also have the"
-        " [options of a run](options.md). Several commands share these options:\n",
+        " [options of a run](options.md). An option with `…` may be"
+        " repeated. Several commands share these options:\n",
         *sorted(shared),
         "",
     ]
@@ -64,7 +67,7 @@ def _commands(name: str, command: Any, depth: int) -> Iterator[tuple[str, Any, i
 
 
 def _options(command: Any) -> list[Any]:
-    return [each for each in command.params if not getattr(each, "hidden", False) and each.name != "help"]
+    return [each for each in command.params if not getattr(each, "hidden", False) and each.name not in TYPER]
 
 
 def _of_a_run(command: Any, option: Any) -> bool:
@@ -79,6 +82,7 @@ def _names(option: Any) -> str:
     if option.param_type_name == "argument":
         return f"`{option.name.upper()}`"
     names = ", ".join(f"`{one}`" for one in [*option.opts, *option.secondary_opts])
+    names += "…" * option.multiple
     return f"{names} {_plain('|'.join(_choices(option.type_descriptor.annotation)))}".rstrip()
 
 
@@ -92,8 +96,9 @@ def _choices(annotation: Any) -> list[str]:
 
 def _meaning(option: Any) -> str:
     text, default = " ".join((getattr(option, "help", None) or "").split()), option.default
+    text = text.replace("; may be repeated", "")
     shown = getattr(option, "show_default", False) and not callable(default)
-    if shown and default not in (None, False, (), []):
+    if shown and default not in (None, False, "", (), []):
         text += f" Default: {default}."
     return _plain(text)
 
@@ -103,7 +108,8 @@ def _plain(text: str) -> str:
 
 
 def _text(text: str) -> str:
-    return re.sub(r"<([A-Za-z])", r"&lt;\1", text.replace("\b", "").replace("\f", "").strip())
+    text = re.sub(r"Example: .*\n+", "", text.replace("\b", "").replace("\f", ""))
+    return re.sub(r"<([A-Za-z])", r"&lt;\1", text.strip())
 
 
 if __name__ == "__main__":

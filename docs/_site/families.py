@@ -22,8 +22,7 @@ DOCUMENTS = (TOP / "README.md", LIST)
 END = "<!-- End of what it writes. -->"
 
 CPU = """*CPU ms*: processor time of a step of the library's environment alone, without accelerations ("bare"), and in a worker's slot
-with its policy and recording: minimum, median, and maximum of the ids that were measured, of which *measured* is the number. `-`:
-none was. `*`: one of them was measured while the machine had more work than cores."""  # noqa: E501
+with its policy and recording: median and range of the *measured* ids. `*`: one of them was measured on a busy machine."""  # noqa: E501
 
 
 def table() -> str:
@@ -31,42 +30,34 @@ def table() -> str:
     original, families = _original(), _families()
     named, newest = original["paper"]["families"], original["newest"]
     lines = [
-        (
-            "| suite | environments | named in the paper | deterministic | played | measured | CPU ms, bare | CPU ms,"
-            " slot | to install |"
-        ),
-        "|---|--:|---|--:|--:|--:|--:|--:|---|",
+        ("| suite | environments | named in the paper | measured | CPU ms, bare | CPU ms, slot | extra |"),
+        "|---|--:|---|--:|--:|--:|---|",
     ]
     for suite in families:
         ids = suite.environments
-        deterministic, n_played = _deterministic(suite), sum(each in _tables()[0] for each in ids)
         family = installs.family_of(ids[0])
         row = installs.installs()[family]
-        how = f"`evopolicy-worker setup {family}`" if row.pins or row.apart else f"extra `{row.extra}`"
+        how = f"`evopolicy-worker setup {family}`" if row.pins or row.apart else f"`{row.extra}`"
         cells = (
             f"[`{suite.name}`](environments/{suite.name}.md)",
             f"{len(ids):,}",
             named.get(suite.name, "-"),
-            "all" if deterministic == len(ids) else f"{deterministic:,}",
-            "all" if n_played == len(ids) else f"{n_played:,}",
             *_cost(suite),
             how + (" and Chromium" if row.browser else ""),
         )
         lines.append(f"| {' | '.join(cells)} |")
-    paper = original["paper"]
-    lacking = "\n".join(f"- {name}: {why}" for name, why in newest["left_out"].items())
+    ids = sum(len(suite.environments) for suite in families)
+    lacking = "; ".join(f"{name} ({why})" for name, why in newest["left_out"].items())
     rows = "\n".join(lines)
     return f"""{rows}
 
 The {len(families)} suites hold {_total(families):,} environments; the suite `paper13` holds the {len(named)} families that the paper
-names. The paper validates its protocol on {paper["validated"]} tasks. The newest version of the original software has
-about {newest["profiles"]} environment profiles in {newest["ecosystems"]} ecosystems, each with its own lock file. *Deterministic*: ids whose episodes depend
-only on seed and actions. *Played*: ids that `check-env` has played.
+names. The episodes of
+{_share(sum(map(_deterministic, families)), ids)} ids depend only on seed and actions, and `check-env` has played
+{_share(sum(each in _tables()[0] for suite in families for each in suite.environments), ids)}.
 {CPU}
 
-evopolicy lacks these environments of that version:
-
-{lacking}"""  # noqa: E501
+{textwrap.fill(f"evopolicy lacks of the original software's newest version: {lacking}.", 125)}"""  # noqa: E501
 
 
 def short() -> str:
@@ -106,6 +97,10 @@ def _deterministic(suite: catalogue.Suite) -> int:
     return sum(catalogue.entry(each).deterministic for each in suite.environments)
 
 
+def _share(number: int, ids: int) -> str:
+    return "all" if number == ids else f"{number:,}"
+
+
 def _total(families: list[catalogue.Suite]) -> int:
     return len({each for suite in families for each in suite.environments})
 
@@ -113,7 +108,8 @@ def _total(families: list[catalogue.Suite]) -> int:
 def _cost(suite: catalogue.Suite) -> tuple[str, str, str]:
     """The number of ids that were measured, and the spans of the bare times and of the slot's, ms."""
     known = [times for each in suite.environments if any(times := _tables()[1].get(each, ("", "")))]
-    bare, slot = (span([each[column] for each in known], per=1000) for column in (0, 1))
+    spans = [span([each[column] for each in known], per=1000).split(", ") for column in (0, 1)]
+    bare, slot = (f"{one[1]} ({one[0]}–{one[2]})" if len(one) == 3 else one[0] for one in spans)
     return f"{len(known):,}", bare, slot
 
 

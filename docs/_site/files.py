@@ -15,13 +15,13 @@ from evopolicy_gateway.suite.suite_file import Override, RunTable
 
 HEAD = """# Files, field by field
 
-`evopolicy files schemas/NAME.schema.json` prints the JSON Schema of each of these files (draft 2020-12).
-Fields without a type are texts. A question mark follows a field that may be absent; its default is given unless it is
-empty, zero, false, or null. *Also* names fields without a description; the schemas have their types.
+`evopolicy files schemas/NAME.schema.json` prints the JSON Schema of each of these files, and of `suite.json`.
+Fields without a type are texts, and `[]` marks an array. A question mark follows a field that may be absent; its
+default is bold, or follows the type, unless it is empty, zero, false, or null. *Also* names fields without a
+description; the schemas have their types.
 
-An editor with TOML schemas checks a suite file whose first line names its schema. Run
-`evopolicy files schemas/suite.toml.schema.json > suite.schema.json`, and begin the file with
-`#:schema ./suite.schema.json`.
+An editor checks a suite file that begins with `#:schema ./suite.schema.json`, where
+`evopolicy files schemas/suite.toml.schema.json > suite.schema.json` wrote that file.
 """
 OF_A_RUN = {*declared(RunOptions), *declared(JailSettings)}
 """Settings that `options.md` describes."""
@@ -33,7 +33,7 @@ def page() -> Iterator[str]:
     """The page's parts. A type is described where it first occurs."""
     yield HEAD
     done: set[type[msgspec.Struct]] = set()
-    for name in ("suite.toml", "agent.toml", "run.json", "summary.json", "suite.json"):
+    for name in ("suite.toml", "agent.toml", "run.json", "summary.json"):
         kind, described = files.KINDS[name], files.schema(name)["$defs"]
         yield f"## {name}\n\n{kind.about} Version {kind.version}.\n"
         later = kind.type in done
@@ -54,15 +54,18 @@ def _struct(struct: type[msgspec.Struct], described: dict[str, Any], *, first: b
         fields = {name: one for name, one in fields.items() if name not in RunTable.__struct_fields__}
     named = [f"`{name}`" for name in fields if struct in (RunTable, JailSettings) and name in OF_A_RUN]
     if named:
-        yield f"[Options of a run](options.md) describes {', '.join(named)}.\n"
+        rest = ", except for:" if len(named) < len(fields) else "."
+        yield f"[Options of a run](options.md) describes its fields{rest}\n"
     bare = [name for name, one in fields.items() if "description" not in one and _type_text(one) in PLAIN]
     for name, one in fields.items():
         if f"`{name}`" not in named and name not in bare:
             default = None if name in needed else one.get("default")
-            value = msgspec.json.encode(default).decode()
             text = f": {one['description']}" if "description" in one else ""
-            text += f" Default: `{value}`." if default and len(value) < 40 else ""
             kind = _type_text(one).removesuffix(" or null")
+            if isinstance(default, str) and f"`{default}`" in kind:
+                kind = kind.replace(f"`{default}`", f"**`{default}`**")
+            elif default and len(value := msgspec.json.encode(default).decode()) < 40:
+                kind += f", `{value}`"
             kind = "" if kind == "string" else f" ({kind})"
             yield _line(f"- `{name}`{'' if name in needed else '?'}{kind}{text}")
     if bare:
@@ -81,10 +84,11 @@ def _type_text(described: dict[str, Any]) -> str:
     if "anyOf" in described:
         return " or ".join(_type_text(each) for each in described["anyOf"])
     if "enum" in described:
-        return " or ".join(f"`{each}`" for each in described["enum"])
+        return ", ".join(f"`{each}`" for each in described["enum"])
     if described.get("type") == "array":
         items: dict[str, Any] = described.get("items") or next(iter(described.get("prefixItems", ())), {})
-        return f"array of {_type_text(items)}" if items else "array"
+        kind = _type_text(items)
+        return f"({kind})[]" if " or " in kind else f"{kind}[]" if items else "array"
     if described.get("type") == "object" and isinstance(described.get("additionalProperties"), dict):
         return f"object of {_type_text(described['additionalProperties']) or 'any'}"
     return str(described.get("type", "any"))

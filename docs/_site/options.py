@@ -18,22 +18,25 @@ def page() -> Iterator[str]:
     """The page's lines."""
     yield "# Options of a run\n"
     yield (
-        "One table for the command line (`evopolicy run`, `local`), for `[defaults]`, `[agents.run]` and"
-        " `[[overrides]]` of a suite file (`jail.…`: in `[agents.jail]`), and for `evp.run` in Python."
-        " The second column has the name in suite files and in Python."
-        " [Commands](cli.md) has the options of every command, with those of a local cluster."
+        "Options of `evopolicy run` and `local`; keys of `[defaults]`, `[agents.run]` and `[[overrides]]` in a suite"
+        " file (`jail.…`: in `[agents.jail]`); keywords of `evp.run` in Python. Keys and keywords have the same names"
+        " with underscores, such as `exp_id`, unless another is given. [Commands](cli.md) has all other options."
     )
     options = [one for each in (RunOptions, JailSettings, ListenerOptions) for one in declared(each).items()]
     for group, members in groupby(options, lambda each: each[1].group):
-        yield f"\n## {group}\n\n| option | elsewhere | meaning |\n|---|---|---|"
+        yield f"\n## {group}\n"
         for name, one in members:
             everywhere = name in RunOptions.__struct_fields__
             suite, python = everywhere and one.option.suite is not None, everywhere and one.option.python
-            alone = "" if suite and python else " (suite)" if suite else " (Python)"
-            text = f"`{name}`{alone}" if suite or python else ""
+            text = "" if suite and python else " (not in Python)" if suite else " (not in suite files)"
+            text = text if suite or python else " (command line only)"
             if name in JailSettings.__struct_fields__:
-                text = f"`jail.{name}`"
-            yield f"| `{one.flag}` | {text} | {one.help}{_default(one.default)} |"
+                text = f", `jail.{name}`"
+            elif (
+                one.flag.replace("-", "_").removeprefix("__").removesuffix("=…").removeprefix("set ") != name
+            ):
+                text = f", `{name}`{text}"
+            yield f"- `{one.flag}`{text}: {one.help}{_default(one.default)}"
 
 
 def _default(value: Any) -> str:

@@ -241,9 +241,7 @@ async def _played(
 
 
 def command(
-    env: Annotated[
-        list[str], typer.Argument(help="Environments, as for --env of a worker: ids, suites, globs, files.")
-    ],
+    env: Annotated[list[str], typer.Argument(help="Ids, suites, globs, or files of environments.")],
     steps: Annotated[int, typer.Option(min=1, help="Greatest number of steps of an episode.")] = 600,
     results: Annotated[
         Path | None,
@@ -257,9 +255,9 @@ def command(
     Example: evopolicy-worker check-env gymnasium/CartPole-v1 my_pkg:MyEnv-v0
 
     The rules: observations within their spaces; invalid actions repaired; the same episode when repeated (fresh,
-    reused, in another process, rendered); no seed in observations or info; the step limit; nothing pickled. The table
-    also shows the time of a step, alone and in a worker's slot, and the memory of the slot. Environments run with your
-    rights, except in the slot. Exit code 1 if one breaks a rule.
+    reused, in another process, rendered); no seed in observations or info; the step limit; nothing pickled. Also
+    measures the time of a step, and the slot's memory. Environments run with your rights, except in the slot. Exit
+    code 1 if one breaks a rule.
     """
     with fail_on_our_errors():
         wanted = catalogue.resolve(env)

@@ -56,8 +56,8 @@ def work(
         list[str] | None,
         typer.Option(
             help=(
-                "Suite (core16), suite id (gym/acrobot), glob (gymnasium/MiniGrid-*), environment file (lander.toml) or"
-                " Gymnasium id (my_pkg:MyEnv-v0); may be repeated."
+                "Suite (core16), id (gym/acrobot), glob (gymnasium/MiniGrid-*), environment file"
+                " (lander.toml) or module:Id; may be repeated."
             )
         ),
     ] = None,
@@ -72,7 +72,7 @@ def work(
     name: Annotated[
         str | None,
         typer.Option(
-            help="Name of this worker; default: that of its certificate, or the host's name with a random suffix."
+            help="Name of this worker; default: its certificate's, or the host's with a random suffix."
         ),
     ] = None,
     credentials_file: Annotated[
@@ -84,14 +84,14 @@ def work(
     policy_package: Annotated[
         list[str] | None,
         typer.Option(
-            help="Package that policies may import in addition to numpy, as at the coordinator; may be repeated.",
+            help="Package that policies may import in addition to numpy; may be repeated.",
         ),
     ] = None,
     unsandboxed: Annotated[
         bool,
         typer.Option(
             "--unsandboxed",
-            help="Also play runs with tier none: their policies run outside any sandbox, with your rights.",
+            help="Also play runs with tier none: their policies run without a sandbox, with your rights.",
         ),
     ] = False,
     ready_file: Annotated[
@@ -99,7 +99,7 @@ def work(
         typer.Option(
             "--ready-file",
             hidden=True,
-            help="What a coordinator that is starting will write: its credentials are read from there.",
+            help="File with credentials that a starting coordinator will write.",
         ),
     ] = None,
     need_tier: Annotated[
@@ -114,14 +114,15 @@ def work(
         float,
         typer.Option(
             min=1.0,
-            help="Time limit for one call of an environment, in seconds; then its process is replaced.",
+            help="Time limit of one call of an environment, in seconds.",
         ),
     ] = USUAL.call_s,
     env_memory: Annotated[
         int, typer.Option(min=64, help="Memory limit of an environment's process, in MiB.")
     ] = USUAL.memory_bytes >> 20,
     grace: Annotated[
-        float, typer.Option(min=0.0, help="Time for running episodes to finish after SIGTERM, in seconds.")
+        float,
+        typer.Option(min=0.0, help="Seconds for running episodes to finish after SIGTERM."),
     ] = 10.0,
     _: Version = False,
 ) -> None:

@@ -45,8 +45,8 @@ def command(
 
     Example: evopolicy-worker setup mo_gymnasium
 
-    Use this for families whose packages conflict with those installed here, or to keep this installation unchanged.
-    Local commands find it and start a worker from it. EVOPOLICY_INSTALLS names another folder for these environments.
+    For families whose packages conflict with those installed here. Local commands start a worker from it.
+    EVOPOLICY_INSTALLS names another folder.
     """
     with fail_on_our_errors(), contextlib.ExitStack() as stack:
         wanted = _wanted(family)

@@ -27,7 +27,7 @@ Format = Literal["csv", "parquet", "tensorboard", "mlflow", "wandb", "minari", "
 
 @app.command("export", epilog="Example: evopolicy export runs/ --to parquet --out tables")
 def export(
-    runs: Annotated[list[Path], typer.Argument(help="Run directories, or folders that contain them.")],
+    runs: Annotated[list[Path], typer.Argument(help="Run directories, or folders of them.")],
     to: Annotated[
         Format,
         typer.Option(
@@ -51,7 +51,7 @@ def export(
 ) -> None:
     """Export runs to tables, experiment trackers, trajectory datasets and agents' logs.
 
-    When repeated, adds new submits to a tracker, and replaces tables and logs.
+    A repeated call adds new submits to a tracker, and replaces tables and logs.
     """
     with fail_on_our_errors():
         if follow and to not in _TRACKERS:

@@ -105,16 +105,13 @@ app = App()
 
 @app.command("files", epilog="Example: evopolicy files deploy --to .")
 def files(
-    name: Annotated[
-        str, typer.Argument(help="A file or folder, such as deploy or constraints.txt; default: all.")
-    ] = "",
+    name: Annotated[str, typer.Argument(help="File or folder, such as deploy; default: all.")] = "",
     to: Annotated[Path | None, typer.Option(help="Copy the files into this folder.")] = None,
 ) -> None:
-    """List, print or copy the examples, deployment files, standard texts, schemas and pages that come with evopolicy.
+    """List, print or copy the files that come with evopolicy: examples, deployment files, standard texts, schemas,
+    pages.
 
-    Commands find these files under the names in the documentation, unless the current folder has a file of that name.
-    texts/ has the standard texts of agents, templates for the settings agents_md and prompts; schemas/ has the JSON
-    Schema of each file.
+    Commands find these files by name, unless the current folder has a file of that name.
     """
     with fail_on_our_errors():
         wanted = name.rstrip("/")

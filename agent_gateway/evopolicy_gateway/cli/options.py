@@ -39,7 +39,7 @@ Local = Annotated[
     bool,
     typer.Option(
         "--local",
-        help="Start a coordinator and a worker on this machine, as `evopolicy local` does.",
+        help="Start a cluster on this machine, as `evopolicy local` does.",
         rich_help_panel=CLUSTER,
     ),
 ]
@@ -48,7 +48,7 @@ Web = Annotated[
     bool,
     typer.Option(
         "--web",
-        help="Show the runs live in a browser, at the address that is printed. See `evopolicy web`.",
+        help="Show the runs live in a browser; see `evopolicy web`.",
         rich_help_panel=RUN,
     ),
 ]

@@ -55,8 +55,7 @@ def run(
 ) -> None:
     """Play one run on a cluster.
 
-    Opens the run at the coordinator, starts its gateway and its agent on this machine, and ends when run.json is
-    written.
+    Starts the run's gateway and agent on this machine, and ends when run.json is written.
     """
     where = Cluster(connect=tuple(connect or ()), file=credentials_file, patient=given.resume)
     held = jail.of_remote_agent() if given.agent == listener.AGENT else jail
@@ -116,12 +115,10 @@ def try_policy(
     env: options.Env,
     cases: Annotated[
         str,
-        typer.Option(
-            help="Train ids and ranges. Equal ids mean equal cases in every call, except with --fresh."
-        ),
+        typer.Option(help="Train ids and ranges. Without --fresh, equal ids are equal cases in every call."),
     ] = "0-3",
     out: Annotated[
-        Path, typer.Option(help="Folder for trajectories; each call makes a new one in it.")
+        Path, typer.Option(help="Folder for trajectories; each call makes a folder in it.")
     ] = Path("tries"),
     connect: Connect = None,
     credentials_file: CredentialsFile = None,
@@ -132,9 +129,8 @@ def try_policy(
 ) -> None:
     """Play a policy on train cases, without a run or an agent.
 
-    Prints the return of each episode. Starts a local cluster unless --connect or --credentials name one; a policy in a
-    run's directory gets the packages of its run, unless --policy-package names others. Exit code 1 if the policy
-    failed.
+    Starts a local cluster unless --connect or --credentials name one. A policy in a run's directory gets the run's
+    packages unless --policy-package names others. Exit code 1 if the policy failed.
     """
     # With numpy, which a command that plays runs does without.
     from evopolicy_gateway.operator import trials
@@ -157,7 +153,7 @@ def diff_runs(
     right: Annotated[Path, typer.Argument(exists=True, file_okay=False, help="Another run directory.")],
     as_json: Annotated[bool, typer.Option("--json", help="Print all differences, as JSON.")] = False,
 ) -> None:
-    """Compare two run directories, except for times, logs and other values that differ between equal runs.
+    """Compare two run directories, except for values that differ between equal runs, such as times and logs.
 
     Exit code 0 if they are equal, 1 if they differ.
     """
@@ -184,9 +180,7 @@ def replay(
     runs: Annotated[Path, typer.Option(help="Folder of the replayed runs.")] = Path("replayed"),
     trust: Annotated[
         bool,
-        typer.Option(
-            "--trust", help="Also replay a run that was recorded by others: it runs their programs."
-        ),
+        typer.Option("--trust", help="Also replay others' runs, which runs their programs."),
     ] = False,
     connect: Connect = None,
     credentials_file: CredentialsFile = None,
@@ -197,8 +191,8 @@ def replay(
 ) -> None:
     """Play a recorded run again: the same agent, with its model's answers from the record.
 
-    No model is asked, and no key is needed. Prints `identical`, or the first place that differs, with exit code 1.
-    Starts a local cluster unless --connect or --credentials name one.
+    Needs no model and no key. Prints `identical`, or the first difference, with exit code 1. Starts a local cluster
+    unless --connect or --credentials name one.
     """
     plan = recorded_agent.plan_of(folder_of(run_directory).root, runs, trusted=trust)
     plan.check()
@@ -223,7 +217,7 @@ def finish(
 ) -> None:
     """Close the run of a remote agent.
 
-    The run accepts no more submits and is scored; its `evopolicy run` then ends.
+    The run is scored, and its `evopolicy run` ends.
     """
     with fail_on_our_errors():
         listener.finish(folder_of(run_directory))

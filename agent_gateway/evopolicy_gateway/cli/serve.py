@@ -41,9 +41,8 @@ def serve(
         typer.Option(
             metavar="BOOT_ID|unknown",
             help=(
-                "Boot id of the agent's machine (there: cat /proc/sys/kernel/random/boot_id), or unknown; default: that"
-                " of this"
-                " machine."
+                "Boot id of the agent's machine (its /proc/sys/kernel/random/boot_id), or"
+                " unknown; default: this machine's."
             ),
         ),
     ] = None,
@@ -58,8 +57,7 @@ def serve(
     Example: evopolicy-gateway runs/evolve/gym_acrobot/first
 
     `evopolicy run` starts this command itself. Start it by hand to continue an open run after a crash, on the same
-    port. Nothing supervises the agent then: close the run with `evopolicy finish` when the agent has ended. Ctrl-C
-    leaves the run open.
+    port. Nothing then supervises the agent: run `evopolicy finish` when it has ended. Ctrl-C leaves the run open.
     """
     setup_logging()
     with _failures_in_the_log() if controlled else fail_on_our_errors():

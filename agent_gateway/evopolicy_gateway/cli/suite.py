@@ -55,8 +55,8 @@ def suite(
         str,
         typer.Argument(
             help=(
-                "TOML file, or one of smoke.toml, breadth.toml, world-controls.toml, core16.toml, core16-paper.toml,"
-                " core16-published.toml, which come with evopolicy."
+                "TOML file; included: smoke.toml, breadth.toml, world-controls.toml, core16.toml,"
+                " core16-paper.toml, core16-published.toml."
             )
         ),
     ],
@@ -66,14 +66,14 @@ def suite(
     runs: Annotated[Path | None, typer.Option(help="The sweep's folder; default: runs/NAME.")] = None,
     only: Annotated[
         list[str] | None,
-        typer.Option(help="Play only runs whose names match this glob, such as 'evolve/*'; may be repeated."),
+        typer.Option(help="Glob of the runs to play, such as 'evolve/*'; may be repeated."),
     ] = None,
     profile: Annotated[Profile | None, Of(RunOptions)],
     parallel: Annotated[
         int | None, typer.Option(min=1, max=256, help="Runs at the same time; overrides the file.")
     ] = None,
     changed: Annotated[
-        Changed, typer.Option(help="Treatment of runs whose settings have changed in the file.")
+        Changed, typer.Option(help="Action for runs whose settings have changed in the file.")
     ] = "refuse",
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Print the plan, and stop.")] = False,
     cluster: Annotated[

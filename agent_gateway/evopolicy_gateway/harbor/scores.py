@@ -220,7 +220,7 @@ app = App()
 def harbor(
     http: Annotated[
         str,
-        typer.Option(metavar="HOST:PORT", help="Address of this machine at which verifiers get scores."),
+        typer.Option(metavar="HOST:PORT", help="Address of this machine for verifiers."),
     ],
     runs: Annotated[
         list[Path] | None,
@@ -231,17 +231,14 @@ def harbor(
     tasks: Annotated[Path, typer.Option(help="Folder for the tasks.")] = Path("harbor-tasks"),
     http_url: Annotated[
         str | None,
-        typer.Option(
-            metavar="URL", help="URL for verifiers, if it differs from --http, such as that of a TLS proxy."
-        ),
+        typer.Option(metavar="URL", help="URL for verifiers, if not that of --http, such as a TLS proxy's."),
     ] = None,
     agent_s: Annotated[float, typer.Option(min=1.0, help="Time of the agent in Harbor, seconds.")] = 86400.0,
 ) -> None:
     """Write a Harbor task for each open run of a remote agent, and serve the runs' scores to Harbor's verifiers until
     Ctrl-C.
 
-    Called again with the same --tasks and --http, it serves the same tasks. A task is one run, so Harbor can play it
-    once.
+    The same --tasks and --http serve the same tasks again. A task is one run, so Harbor can play it once.
     """
     with fail_on_our_errors():
         run_to_end(_serve(listener_of(http, http_url), runs or [], tasks, agent_s))

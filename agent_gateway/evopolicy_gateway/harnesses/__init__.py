@@ -160,7 +160,7 @@ def _cli_agent(config: AgentConfig, started_in: Path) -> CliAgent:
     if config.max_cost is not None and config.prices is None:
         raise ConfigError(
             "max_cost needs prices in US dollars per million tokens: give a file with --set prices=FILE.toml, or write"
-            " prices = { input = 1.0, output = 10.0 } beside it"
+            " prices = { input = 1.0, output = 10.0 } in its file"
         )
     if config.program:
         config = msgspec.structs.replace(config, program=tuple(_absolute(config.program, started_in)))

@@ -33,18 +33,18 @@ _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,63}")
 
 
 class McpServer(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """A server of the Model Context Protocol that the agent starts in its jail and speaks to over stdin and stdout."""
+    """A server of the Model Context Protocol that the agent starts in its jail."""
 
     command: str
     """Its program: on the PATH, or a file."""
     args: tuple[str, ...] = ()
-    """Words that are files or folders below the folder in which the command was started belong to its digest."""
+    """Files and folders among them, below the folder in which the command was started, belong to its digest."""
     files: tuple[str, ...] = ()
     """Further files and folders that it needs."""
     environment: dict[str, str] = {}
     """Recorded in `run.json`: no secrets here."""
     hosts: tuple[str, ...] = ()
-    """`HOST` (port 443) or `HOST:PORT` that it reaches; the jail allows them, to all of the agent."""
+    """`HOST` (port 443) or `HOST:PORT`; the jail then allows them to the whole agent."""
 
 
 class File(NamedTuple):

@@ -30,7 +30,7 @@ class Prices(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     cache_read: Price = 0.0
     cache_creation: Price = 0.0
     tiers: dict[str, Annotated[float, msgspec.Meta(ge=0.0, le=1e3)]] = {}
-    """Factor on all of them for a service tier, such as `priority` or `flex`."""
+    """Factor on all prices for a service tier, such as `priority`."""
 
 
 class Usage(msgspec.Struct, frozen=True, kw_only=True):

@@ -142,8 +142,8 @@ class RunPart(msgspec.Struct, frozen=True, kw_only=True):
     budget: Count | None = None
     """Train episodes; default: the suite's."""
     profile: Annotated[Profile, Option(command=Literal["published", "published-data"] | None)] | None = None
-    """published: all settings of the published protocol (docs/reference/protocol.md), with its case files in --data and
-    the paper's 16 validation and 32 held-out cases; published-data: with all 64 and 256 of the files."""
+    """published: all settings of the published protocol (docs/reference/protocol.md), with its case files in --data;
+    published-data: with all 64 validation and 256 held-out cases of the files."""
     runs: Annotated[Path, OF_ONE_RUN] = Path("runs")
     """Folder of run directories."""
     exp_id: Annotated[str | None, OF_ONE_RUN] = None
@@ -211,8 +211,8 @@ class RunOptions(PolicyPart, frozen=True, kw_only=True):
     group: ClassVar[str] = "Agent"
 
     start_from: Annotated[str | None, Option(metavar="RUN@submit_NNN", suite=str)] = None
-    """Start with the workspace as it was at that submit of an earlier run of this cluster, and its feedback below
-    history/. The run has a full budget of its own."""
+    """Start with the workspace of an earlier run's submit, and its feedback below history/. The run has a full
+    budget."""
     agents_md: Annotated[Path | None, RARE] = None
     """Replacement for AGENTS.md; `evopolicy files texts/agents.md` prints the standard one."""
     prompts: Annotated[Path | None, RARE] = None
@@ -224,12 +224,12 @@ class RunOptions(PolicyPart, frozen=True, kw_only=True):
     finish: Annotated[FinishRule | None, RARE] = None
     """early: the agent may stop before it has spent its budget (default); budget: that is an error, as published."""
     record_model: Level = "digests"
-    """Record of the calls of the agent's model, below logs/model/: off, digests, or full, which `evopolicy replay`
-    needs. For agents whose model is reached with a key."""
+    """Record of the model's calls in logs/model/: off, digests, or full, which `evopolicy replay` needs. For models
+    reached with a key."""
     agent_wall_s: Annotated[Seconds, Option(suite=Annotated[float, Meta(gt=0)])] = WALL_S
     """Time limit for the agent, in seconds."""
     agent_silence_s: Annotated[Seconds, Option(suite=Annotated[float, Meta(gt=0)], by_set=True)] = SILENCE_S
-    """End an agent that submits nothing, changes no file and uses no processor time for this long, in seconds."""
+    """End an agent that is inactive for this long, in seconds."""
 
     agent_cpus: Annotated[float | None, RARE] = None
     """Processor time for the agent's programs, in cores."""
@@ -356,18 +356,17 @@ class ClusterOptions(msgspec.Struct, frozen=True, kw_only=True):
     group: ClassVar[str] = "Local cluster"
 
     slots: Annotated[int, Meta(ge=1, le=1024)] = 2
-    """Episodes that the local worker plays at the same time. Environments in a virtual environment of their own have a
-    worker with as many. Commands that share a cluster add their slots."""
+    """Episodes that each local worker plays at the same time. Commands that share a cluster add their slots."""
     state: Path | None = None
-    """State folder of the local cluster. Default: $XDG_STATE_HOME/evopolicy/local, which all your local runs share, so
-    that they have the same cases. Commands with the same folder share a cluster while they run."""
+    """State folder of the local cluster. Commands with the same folder have the same cases, and share a cluster while
+    they run. Default: $XDG_STATE_HOME/evopolicy/local."""
     fresh: bool = False
     """Use a temporary state folder: new cases, and no later comparison or `verify`."""
     data: Path | None = None
     """Folder of split files (`evopolicy data make`); default: derived from the state's secret."""
     hidden_isolation: Literal["related", "strict", "off"] | None = None
-    """Agents beside which no hidden episode is played on a kernel: those of runs with the same hidden cases (related,
-    the default), all (strict), or none (off)."""
+    """Agents that share no kernel with hidden episodes: those of runs with the same hidden cases (related,
+    default), all (strict), or none (off)."""
     policy_package: Annotated[Several, Option(metavar="NAME")] = None
     """Package that policies may import in addition to numpy."""
     env_timeout: Annotated[Seconds | None, RARE] = None

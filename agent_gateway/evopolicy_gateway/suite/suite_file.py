@@ -80,7 +80,7 @@ class Parallel(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     providers: dict[str, Count] = {}
     """Of each provider, on each host."""
     claim_ttl_s: Annotated[float, Meta(ge=1, le=3600)] = 60.0
-    """A host that is silent for this long loses its runs to the others, seconds."""
+    """A host that is silent for this many seconds loses its runs to the others."""
 
 
 class Caps(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

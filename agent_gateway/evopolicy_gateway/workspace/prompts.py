@@ -48,7 +48,7 @@ class Prompts(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     go_on: str = "$standard"
     """For an agent that stopped with budget left."""
     interrupted: str = "$standard"
-    """For a session that resumes after a failure that was not the agent's own."""
+    """For a session that resumes after a failure."""
 
     @property
     def digest(self) -> str:

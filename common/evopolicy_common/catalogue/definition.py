@@ -179,7 +179,9 @@ def _task(where: str, path: Path, fields: dict[str, Any], task_file: object) -> 
     if "task" in fields:
         raise ConfigError(f"{where}: task and task_file exclude each other: give only one of them")
     if not isinstance(task_file, str):
-        raise ConfigError(f"{where}: task_file is {task_file!r:.80}: the name of a text file beside this one")
+        raise ConfigError(
+            f"{where}: task_file is {task_file!r:.80}: it has to name a text file in this file's folder"
+        )
     what = f"{where}: task_file {task_file!r}"
     folder = path.parent.resolve()
     try:

@@ -34,7 +34,8 @@ CredentialsFile = Annotated[
     Path | None,
     typer.Option(
         "--credentials",
-        help="Folder of `evopolicy-coordinator certs issue operator`, or the coordinator's STATE/credentials.",
+        help="Folder of `evopolicy-coordinator certs issue operator`, or STATE/credentials of the"
+        " coordinator.",
         rich_help_panel=CLUSTER,
     ),
 ]

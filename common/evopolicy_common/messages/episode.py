@@ -43,7 +43,7 @@ class ResourceLimits(msgspec.Struct, frozen=True, kw_only=True):
     """Limits of one episode's policy. `/info.resource_limits` shows all of them."""
 
     episode_wall_s: Number = 600.0
-    """Wall time of the policy's own work in one episode (import, init, reset, acts), seconds."""
+    """Wall time of the policy's work in one episode, seconds."""
     act_wall_s: Number = 20.0
     """Wall time of one `act` or `reset`, seconds."""
     init_wall_s: Number = 60.0
@@ -51,7 +51,7 @@ class ResourceLimits(msgspec.Struct, frozen=True, kw_only=True):
     cpu_s: Number = 300.0
     """CPU time of the policy process in one episode, seconds."""
     memory_bytes: Int = 1 << 30
-    """Address space of the policy beyond what Python and the allowed packages take, bytes."""
+    """Address space of the policy beyond that of Python and the allowed packages, bytes."""
     processes: Int = 16
     """Threads of the policy process; it may start no other process."""
     file_bytes: Int = 64 << 20
@@ -59,17 +59,17 @@ class ResourceLimits(msgspec.Struct, frozen=True, kw_only=True):
     files: Int = 4096
     """Files and folders that it may create there, besides its bundle's."""
     open_files: Int = 256
-    """Its open file descriptors, including the five that it starts with."""
+    """Open file descriptors, with the five of its start."""
     output_bytes: Int = 64 << 10
-    """Bytes kept of each of stdout and stderr of an episode."""
+    """Bytes kept of an episode's stdout, and of its stderr."""
     action_bytes: Int = 16 << 10
-    """Size of one action, bytes, plus 16 bytes for each number or character of the action space. It may have one value
-    for every 16 bytes."""
+    """Size of one action beyond 16 bytes for each number or character of the action space, bytes. It may have one
+    value for every 16 bytes."""
     episode_action_bytes: Int = 4 << 20
-    """Size of an episode's actions together beyond what the action space needs, bytes."""
+    """The same, of all actions of an episode."""
     feedback_bytes: Int = 16 << 30
-    """Size of the files of all the run's episodes together, bytes. Each episode has an equal share. Beyond it, an
-    episode loses its video, then its observations, then its rows."""
+    """Size of all episodes' files of the run, bytes. Beyond an equal share, an episode loses its video, then its
+    observations, then its rows."""
     submit_wall_s: Number | None = None
     """Wall time of a whole submit, seconds; None for no limit."""
 

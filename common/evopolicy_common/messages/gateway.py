@@ -38,7 +38,7 @@ VideoOption = Literal["off", "first", "all"]
 SimulationRule = Literal["forbidden", "allowed"]
 """Whether the agent's rules allow it to simulate the environment outside its submits."""
 FinishRule = Literal["early", "budget"]
-"""Whether a run whose agent stops before it has spent its budget is scored (`early`) or is an error (`budget`)."""
+"""A run whose agent stops before its budget is spent is scored (`early`), or an error (`budget`)."""
 FeedbackDetail = Literal["scores", "trajectories", "pictures"]
 """`scores`: the summary alone; `trajectories`: text too; `pictures`: also files of observations and
 videos."""

@@ -62,13 +62,13 @@ class Committed(msgspec.Struct, frozen=True, kw_only=True):
     commitment: Word
     """Salted SHA-256 (hex) of the run's splits and settings."""
     epoch: Word
-    """The epoch of the run's cases: all runs of an epoch derive theirs from one secret."""
+    """The epoch of the run's cases."""
     opened: Int
     """Index of the journal entry that holds the commitment, from 0."""
     opened_head: Word
     """Hash (hex) of the journal up to that entry."""
     ended: Int | None = None
-    """Index of the entry that holds the digest of the run's result; None until the run is finished."""
+    """Index of the entry with the digest of the run's result; None until then."""
     ended_head: Word = ""
     """Hash (hex) of the journal up to that entry."""
 

@@ -74,11 +74,11 @@ class Start(msgspec.Struct, frozen=True, kw_only=True):
     """The coordinator's name of that run."""
     submit_index: Int
     tree: Word
-    """SHA-256, hex, of the recorded workspace, as that run's gateway named it with the submit."""
+    """SHA-256, hex, of the recorded workspace."""
     parent_scored: bool = False
-    """Set by the coordinator: the earlier agent had ended, so that a result may have chosen the place."""
+    """The earlier agent had ended, so that a result may have chosen the place."""
     line: Line = Line()
-    """The weakest conditions of the runs before, from the coordinator. `unknown` while one of their agents is alive."""
+    """The weakest conditions of the runs before. `unknown` while one of their agents is alive."""
 
     @property
     def text(self) -> str:

@@ -13,7 +13,7 @@ from pathlib import Path
 
 _BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
 
-NO_BOOT_ID = f"the kernel does not tell its boot id: mount /proc so that {_BOOT_ID} can be read"
+NO_BOOT_ID = f"the kernel does not show its boot id: mount /proc so that {_BOOT_ID} can be read"
 """Why a worker plays no hidden episodes, and why an agent counts as being on every kernel."""
 
 

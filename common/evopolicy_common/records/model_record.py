@@ -132,7 +132,7 @@ class Pack:
                 raise ValueError("too large")
             data = zstandard.ZstdDecompressor().decompress(packed, max_output_size=MAX_CONTENT_BYTES)
             if key_of(data) != key:
-                raise ValueError("other bytes than its digest tells")
+                raise ValueError("bytes that do not match its digest")
         except KeyError as error:
             raise ConfigError(f"{self._path} has no content {key}") from error
         except (OSError, ValueError, zstandard.ZstdError) as error:

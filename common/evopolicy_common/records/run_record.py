@@ -41,16 +41,16 @@ PROTOCOL_VERSION = "protocol/v2.0-draft"
 
 
 class Tokens(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
-    """Token use of the whole run, as the paper's appendix on token accounting defines it. Counts, not millions."""
+    """Tokens of the whole run, as the paper's appendix defines them."""
 
     input_noncached: int
-    """Input tokens not served from a cache (for streams that include cached ones: input minus cached)."""
+    """Input tokens not served from a cache."""
     cache_read: int
     cache_creation: int
     output: int
     """Output tokens, including reasoning."""
     reasoning: int | None = None
-    """Reasoning tokens within `output`; None when the stream does not report them."""
+    """Reasoning tokens within `output`; None if unreported."""
     cost: float | None = None
     """Cost in US dollars; None without prices."""
 
@@ -74,8 +74,8 @@ class ModelUse(msgspec.Struct, frozen=True, kw_only=True):
     """How the agent used its model, besides `tokens`."""
 
     metering: Literal["relay", "agent"]
-    """`relay`: the relay counted every request and had the key. `agent`: the agent's own count of tokens; the following
-    fields are unknown."""
+    """`relay`: the relay counted every request and had the key. `agent`: the agent's own count; the following fields
+    are unknown."""
     limits: ModelLimits | None = None
     """None: this software sets none."""
     requests: int | None = None
@@ -83,19 +83,19 @@ class ModelUse(msgspec.Struct, frozen=True, kw_only=True):
     requests_failed: int = 0
     """Of these, requests without a whole answer."""
     requests_estimated: int = 0
-    """Requests with an estimated count: the answer broke off, or stated no valid count."""
+    """Requests with an estimated count: the answer broke off or had no valid count."""
     models: dict[str, int] = {}
     """Requests by the model that the answer names."""
     other_models: dict[str, int] = {}
-    """Requests by the model that was asked for and is not `model_string`."""
+    """Requests for other models than `model_string`, by model."""
     hosted_tools: dict[str, int] = {}
-    """Requests that offer a tool which the provider runs, by its kind, such as `web_search`."""
+    """Requests that offer a tool of the provider, by its kind, such as `web_search`."""
     first_token_s: float | None = None
     """Mean time to the first bytes of an answer."""
     rate_limit_s: float = 0.0
     """Sum of the times for which the provider asked to wait."""
     record: Level | None = None
-    """How much of its calls is in `logs/model/`; None in older files, and where the relay did not count."""
+    """How much of its calls is in `logs/model/`; None if the relay did not count."""
     record_stopped: str = ""
     """Why the record ends before the run; empty where it does not."""
     reported: Tokens | None = None
@@ -124,19 +124,19 @@ class AgentResources(msgspec.Struct, frozen=True, kw_only=True):
     """An agent's share of its machine."""
 
     limits: AgentLimits
-    """Those that something kept; a limit that this machine could not keep is None."""
+    """None: a limit that this machine could not enforce."""
     kept_by: dict[str, str] = {}
     """`cgroup v1`, `cgroup v2`, `affinity` or `rlimit`, by name of the limit."""
     cpu_s: float = 0.0
     """Processor time of all its programs, seconds."""
     memory_peak_bytes: int = 0
-    """Most memory at once: of the cgroup, with cached files, or sum of resident sizes every 5 s."""
+    """Peak memory: of the cgroup, with cached files, or sum of resident sizes every 5 s."""
     disk_bytes: int = 0
     """Most space of its files that was seen."""
     ended_for_memory: int = 0
     """Processes that the kernel ended at the memory limit."""
     refused_forks: int = 0
-    """Processes that the kernel did not start at the limit of their number."""
+    """Processes refused at the limit of their number."""
 
     def after(self, before: AgentResources | None) -> AgentResources:
         """Together with what earlier programs of the agent used, whose limits were the same."""
@@ -161,7 +161,7 @@ class AgentInput(msgspec.Struct, frozen=True, kw_only=True):
     kind: Literal["skill", "mcp"]
     name: str
     digest: str
-    """SHA-256 (`sha256:…`) of its files, and of a server's command line, program and variables."""
+    """SHA-256 of its files, and of a server's command line, program and variables."""
     hosts: tuple[str, ...] = ()
     """Hosts that a server reaches; the agent's jail allowed them."""
 
@@ -176,12 +176,12 @@ class Agent(msgspec.Struct, frozen=True, kw_only=True):
     """The agent of the run: one leaderboard entry."""
 
     entry: str
-    """Name of the leaderboard entry: model and harness, or the operator's name for it."""
+    """Name of the leaderboard entry."""
     harness: str
     """`codex`, `claude-code`, `command`, `replay`, `evolve`, …"""
     cli_version: str | None = None
     model_string: str | None = None
-    """The model that was configured, or else the one that answered most; None for agents without a model."""
+    """The configured model, or the one that answered most; None without a model."""
     prompts: str = ""
     """SHA-256 (`sha256:…`) of the operator's prompts; empty: the standard ones."""
     inputs: tuple[AgentInput, ...] = ()
@@ -189,18 +189,18 @@ class Agent(msgspec.Struct, frozen=True, kw_only=True):
     settings: dict[str, Any] = {}
     """Other start settings: effort, extra arguments, retry base; no secrets."""
     retries: int = 0
-    """How often the session was resumed after a provider's or harness's failure."""
+    """Resumptions of the session after a provider's or harness's failure."""
     turns: int = 0
     tokens: Tokens | None = None
     """None when nothing counted them."""
     model_use: ModelUse | None = None
     """None for agents without a model."""
     resources: AgentResources | None = None
-    """None for agents that were not started here, and in older files."""
+    """None for agents that were not started here."""
 
 
 class ExperimentDimensions(msgspec.Struct, frozen=True, kw_only=True):
-    """Settings that define the experiment besides agent and environment; runs that differ here are not comparable."""
+    """Settings that make runs incomparable if they differ."""
 
     episode_budget: int
     min_episodes_per_submit: int
@@ -213,24 +213,24 @@ class ExperimentDimensions(msgspec.Struct, frozen=True, kw_only=True):
     video: VideoOption = "off"
     limits: ResourceLimits | None = None
     simulation: SimulationRule = "allowed"
-    """Whether the rules allow the agent to simulate the environment, as runs without this field do."""
+    """Whether the rules allow the agent to simulate the environment."""
     finish: FinishRule = "early"
-    """Whether a run whose agent stops before it has spent its budget is scored (`early`) or is an error (`budget`)."""
+    """A run whose agent stops before its budget is spent is scored (`early`), or an error (`budget`)."""
     step_limit: StepLimit = "natural"
-    """Step limit: the published software's, or the environment's own, as in runs from before this field."""
+    """The published software's, or the environment's own."""
     failed_episodes: FailedEpisodes = "play-on"
-    """After a failure of the policy, random actions play the episode (`play-on`), or the submit has no mean return and
-    its checkpoint is not eligible (`end-submit`)."""
+    """After a policy's failure, random actions play the episode (`play-on`), or the submit has no mean return and is
+    not eligible (`end-submit`)."""
     hidden_evaluation: HiddenEvaluation = "submit"
-    """Arguments of a policy on hidden cases: those of its own submit, or those of one list of all cases (`pool`)."""
+    """A policy's arguments on hidden cases: its own submit's, or those of one list of all cases (`pool`)."""
     profile: Profile = "own"
-    """`published`: all choices of the published protocol together, including its public case files."""
+    """`published`: all choices of the published protocol, its public case files included."""
     feedback: FeedbackDetail = "pictures"
-    """The agent's feedback level; all feedback in runs from before this field existed."""
+    """The agent's feedback level."""
     agents_md: str = ""
     """SHA-256 (`sha256:…`) of the operator's text in place of `AGENTS.md`; empty: the standard text."""
     hidden_cases: HiddenCases = "shared"
-    """Validation and held-out cases: `shared` by all runs of the environment, or `per_run` (no paired statistics)."""
+    """Validation and held-out cases: `shared` by all runs of the environment, or `per_run` (not paired)."""
 
 
 class Timing(msgspec.Struct, frozen=True, kw_only=True):
@@ -249,9 +249,9 @@ class Timing(msgspec.Struct, frozen=True, kw_only=True):
     feedback_s: float = 0.0
     """From the last episode's result to the reply to the submit."""
     held_s: float = 0.0
-    """A submit waited because hidden episodes occupied the machines; part of no phase, and counted against no limit."""
+    """A submit waited for hidden episodes; part of no phase, and counted against no limit."""
     permit_s: float = 0.0
-    """The agent's start waited while its machine played hidden episodes of related runs; part of no phase."""
+    """The agent's start waited for hidden episodes of related runs; part of no phase."""
     finalise_s: float = 0.0
     """From the agent's end to `run.json`."""
 
@@ -276,8 +276,7 @@ class ReferenceScore(msgspec.Struct, frozen=True, kw_only=True):
     """Population standard deviation."""
     returns: tuple[float, ...] = ()
     seeded_by: Literal["case", "run"] = "run"
-    """Source of the actions. `case`: split and case only, so the numbers are equal in every run on the split. `run`:
-    a secret of the run, as in earlier versions, so the numbers differ between runs."""
+    """Source of the actions. `case`: split and case, so that runs have equal numbers. `run`: a secret of the run."""
 
 
 class Outcome(msgspec.Struct, frozen=True, kw_only=True):
@@ -291,17 +290,17 @@ class Outcome(msgspec.Struct, frozen=True, kw_only=True):
     best_submit_index: int | None = None
     """Index of the submit of the selected checkpoint."""
     val_scores: dict[str, float] | None = None
-    """Submit index (decimal text) to mean return on validation, for every eligible `ok` checkpoint."""
+    """Mean validation return of each eligible checkpoint, by submit index (decimal text)."""
     heldout_mean_return: float | None = None
     heldout_std_return: float | None = None
     """Population standard deviation."""
     heldout_returns: tuple[float, ...] = ()
     """In the order of the split's cases."""
     heldout_successes: tuple[bool, ...] = ()
-    """Whether each of these episodes solved the task, as the environment reports it; empty where it reports nothing."""
+    """Whether each episode solved the task; empty if the environment does not report it."""
     policy_failures: tuple[PolicyFailureRecord, ...] = ()
     quarantined_submits: tuple[int, ...] = ()
-    """`ok` checkpoints that are not eligible: with `failed_episodes` = "end-submit", their policy failed in
+    """`ok` checkpoints that are not eligible (`failed_episodes` = "end-submit"): their policy failed in
     validation."""
     random_reference: ReferenceScore | None = None
     closed_reason: str = ""
@@ -356,7 +355,7 @@ class Replay(msgspec.Struct, frozen=True, kw_only=True):
     length: int | None = None
     """Number of steps."""
     filmstrip: str | None = None
-    """A PNG with some of its frames side by side; None when it does not exist."""
+    """A PNG with some of its frames side by side."""
 
 
 class Artifacts(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
@@ -380,26 +379,26 @@ class Versions(msgspec.Struct, frozen=True, kw_only=True):
     agents_md_hash: str
     """Hash of `AGENTS.md` in the workspace, with this run's URLs."""
     data_train_hash: str
-    """Hash of the bytes of `train.json`; for cases that come from no file, of the cases as canonical JSON."""
+    """Hash of `train.json`; without a file, of the cases as canonical JSON."""
     data_valid_hash: str
     data_heldout_hash: str
     rules_hash: str = ""
-    """Hash of `AGENTS.md` with placeholders for its URLs: equal for runs with equal rules."""
+    """Hash of `AGENTS.md` with placeholders for its URLs."""
     cases_hashes: dict[Split, str] = {}
     """Hashes of the run's cases as canonical JSON, by split."""
     fingerprint: dict[str, str] = {}
-    """Library to version, as reported by the workers with which the run started."""
+    """Library to version, from the workers with which the run started."""
     installations: tuple[str, ...] = ()
-    """Installations that played the run's episodes, as `NAME@DIGEST`: the families of `evopolicy-worker setup`, or
-    `base`, and 12 hex digits of a SHA-256 over its packages."""
+    """Installations that played the run's episodes, as `NAME@DIGEST`: families of `evopolicy-worker setup`, or
+    `base`, and a hash of their packages."""
     fingerprint_overrides: tuple[str, ...] = ()
-    """`CLASS → CLASS: why` for each time an operator let the run continue with other versions; empty with one class."""
+    """`CLASS → CLASS: why` for each `evopolicy runs repin`."""
     data_secret: bool = True
     """False when the splits derive from a small public seed."""
     initial_policy_hash: str | None = None
     """Hash of the initial `policy.py` of the workspace."""
     env_deterministic: bool = True
-    """False when the environment does not repeat an episode from its seed and actions."""
+    """Whether seed and actions determine an episode."""
 
     def cases_hash(self, split: Split) -> str:
         """The hash that identifies a split's cases: `cases_hashes`, or the file's hash if that is missing."""
@@ -420,16 +419,16 @@ class RunRecord(msgspec.Struct, frozen=True, kw_only=True):
     env: str
     """Suite id of the environment."""
     env_title: str = ""
-    """Short name of the environment for tables; empty in older files, and where no worker described it."""
+    """Short name of the environment for tables; empty if no worker described it."""
     env_family: str = ""
-    """Key of the family in which its scores are averaged; empty as the title."""
+    """Key of the family in which its scores are averaged."""
     exp_id: str
     repeat: int = 0
     """Number of the repeat of one agent on one environment, from 0."""
     attempt: int = 0
     """How often the operator restarted this run from scratch."""
     run: str = ""
-    """The coordinator's own name of the run, which identifies its stored data there; empty in older files."""
+    """The coordinator's name of the run."""
     agent: Agent
     sandbox_tier: Tier
     jail: str
@@ -445,13 +444,13 @@ class RunRecord(msgspec.Struct, frozen=True, kw_only=True):
     replays: tuple[Replay, ...] = ()
     versions: Versions
     committed: Committed | None = None
-    """The coordinator's commitment before the agent started; None for runs from before the journal."""
+    """The coordinator's commitment before the agent started."""
     start: Start | None = None
-    """The submit of an earlier run whose workspace this one began with; None: the usual workspace."""
+    """The submit of an earlier run with whose workspace this one began."""
     replay_of: str = ""
-    """The coordinator's name of the run that `evopolicy replay` played again; empty: a run of its own."""
+    """The coordinator's name of the run that `evopolicy replay` played again."""
     trees: dict[str, str] = {}
-    """Submit index (decimal text) to the SHA-256 of `trees/submit_NNN.json`; empty in older files."""
+    """Submit index (decimal text) to the SHA-256 of `trees/submit_NNN.json`."""
 
     @property
     def line(self) -> Line:

@@ -29,13 +29,13 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
     env: str
     """Suite id, such as `gym/acrobot`."""
     status: SubmitStatus | Literal["budget_invalid", "invalid_env_instance"]
-    """The last two: only of the published software, which gives a folder to some requests that it refuses."""
+    """The last two: only in the published software."""
     n_episodes: int
     """Episodes charged; 0 when `cancelled`."""
     first_global_episode: int | None
-    """Number of its first episode among the run's attempted episodes, from 0; null when not ok."""
+    """Number of its first episode in the run, from 0; null when not ok."""
     env_instances: tuple[int | bool, ...] | None
-    """Train ids in request order, repeats kept. The published software repeats a request's `true` and `false`."""
+    """Train ids in request order, with repeats. The published software keeps `true` and `false`."""
     remaining_budget: int
     """Episodes left after this submit."""
     submit_started_at: str
@@ -57,15 +57,15 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
     errors: tuple[int, ...] | None
     """Local indices of the episodes whose policy failed, time limits included."""
     reward_components_mean: dict[str, float] | None = None
-    """Mean over episodes of each component's sum; missing when the environment reports no components."""
+    """Mean over episodes of each component's sum; missing without components."""
     reward_components_per_episode: tuple[dict[str, float], ...] | None = None
-    """Each episode's sums, in request order; missing in the same case."""
+    """Each episode's sums, in request order."""
     successes: tuple[bool | None, ...] | None = None
-    """Whether each episode solved the task, as the environment reports it; missing where it reports nothing."""
+    """Whether each episode solved the task; missing if the environment does not report it."""
     policy_failures: int | None = None
-    """Number of episodes in which the policy failed; missing when not ok."""
+    """Episodes in which the policy failed; missing when not ok."""
     warning: str | None = None
-    """How the policy failed, in words for the agent; missing when it did not."""
+    """How the policy failed; missing if it did not."""
 
 
 _decoder = msgspec.json.Decoder(Summary)

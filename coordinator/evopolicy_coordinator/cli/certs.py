@@ -35,8 +35,8 @@ def init(
     host: Annotated[
         list[str] | None,
         typer.Option(
-            help="Name or address at which other machines reach the coordinator; may be repeated. "
-            "Default: this machine's address and name. Loopback names are always added."
+            help="Name or address at which other machines reach the coordinator; may be repeated."
+            " Default: this machine's address and name."
         ),
     ] = None,
     cluster: Annotated[
@@ -48,9 +48,7 @@ def init(
     ] = False,
     force: Annotated[
         bool,
-        typer.Option(
-            "--force", help="Also make a new authority, which invalidates the folders of all machines."
-        ),
+        typer.Option("--force", help="Make a new authority too: the folders of all machines become invalid."),
     ] = False,
 ) -> None:
     """Make the cluster's certificate authority and the coordinator's certificate, in the state folder.
@@ -96,14 +94,14 @@ def issue(
     renew: Annotated[
         bool,
         typer.Option(
-            "--renew", help="Invalidate the folder issued earlier under this name, and make a new one."
+            "--renew", help="Replace the folder issued earlier under this name, which becomes invalid."
         ),
     ] = False,
 ) -> None:
     """Write the folder that a machine needs to join: certificates, key, user and password.
 
-    Copy the folder to that machine (scp -rp keeps its modes) and name it with --credentials there. A running
-    coordinator admits the machine within seconds. An operator's folder also starts gateways.
+    Copy the folder to that machine (scp -rp) and name it with --credentials there. A running coordinator admits the
+    machine within seconds. An operator's folder also starts gateways.
     """
     root = state or default_state_dir()
     usual = first_endpoint(root)  # first: it makes no folder of a wrong --state

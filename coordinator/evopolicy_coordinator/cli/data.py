@@ -41,13 +41,13 @@ app = App(
 )
 def make(
     env: Annotated[list[str], typer.Option(help="Suite, suite id or glob; may be repeated.")],
-    root: Annotated[Path, typer.Option(help="Folder to write, with one folder for each environment.")],
+    root: Annotated[Path, typer.Option(help="Folder to write.")],
     seed: Annotated[
         int | None,
         typer.Option(
             min=0,
-            help="Public seed. Anyone who knows it can derive the cases, so the files say `secret: false`."
-            " Default: random bits that are not stored.",
+            help="Public seed, from which anyone can derive the cases: the files say `secret:"
+            " false`. Default: random bits that are not stored.",
         ),
     ] = None,
     train: Annotated[

@@ -42,7 +42,7 @@ def envs(
     file: CredentialsFile = None,
     env: Annotated[
         str | None,
-        typer.Option(help="Suite, glob for ids, or an id, which shows everything, with the task text."),
+        typer.Option(help="Suite, glob, or an id, which also shows the task text."),
     ] = None,
     as_json: Json = False,
 ) -> None:

@@ -30,8 +30,8 @@ from evopolicy_results.publish.signatures import HEAD
 _PAGE_BYTES = 1 << 20
 
 app = App(
-    help="List epochs, and begin a new one. Runs of one epoch have cases derived from one secret; publishing"
-    " reveals it.",
+    help="List epochs, and begin a new one. All runs of an epoch derive their cases from one"
+    " secret, which publishing reveals.",
     no_args_is_help=True,
 )
 
@@ -62,7 +62,7 @@ def list_(state: State = None, as_json: Json = False) -> None:
 def new(state: State = None) -> None:
     """Begin a new epoch: later runs get a new secret, and new cases. Stop the coordinator first.
 
-    Unfinished runs keep their cases. Do not compare scores of different epochs: their cases differ.
+    Unfinished runs keep their cases. Scores of different epochs are not comparable: their cases differ.
     """
     root = state or default_state_dir()
     if not (root / "identity.json").is_file():
@@ -97,7 +97,7 @@ def countersign(
 ) -> None:
     """Sign the head of another coordinator's journal, as evidence that it existed at this time.
 
-    The signature says nothing about the content of that journal. Keep a copy of the file yourself.
+    The signature says nothing about the journal's content. Keep a copy of the file.
     """
     root = state or default_state_dir()
     if not re.fullmatch(r"[0-9a-fA-F]{64}", head):

@@ -25,11 +25,9 @@ disk_app = App(name="disk")
 def collect(
     state: State = None,
     older_than: Annotated[
-        float, typer.Option(min=0.0, help="Keep runs that finished within this number of days.")
+        float, typer.Option(min=0.0, help="Days since the end of a run; younger runs stay.")
     ] = 7.0,
-    dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="Print what would be deleted, and delete nothing.")
-    ] = False,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Only print what would be deleted.")] = False,
 ) -> None:
     """Delete stored episodes and bundles of runs that finished long ago, and unreferenced blobs.
 
@@ -62,7 +60,7 @@ def disk(
 ) -> None:
     """Show the disk space of stored runs by environment, and whether a planned sweep fits.
 
-    Run directories need space in addition; their size is printed too. Exit code 1 if the sweep does not fit.
+    Also prints the size of run directories. Exit code 1 if the sweep does not fit.
     """
     root = state or default_state_dir()
     used = disk_use.use(root)

@@ -57,8 +57,8 @@ def serve(
     listen: Annotated[
         list[str] | None,
         typer.Option(
-            help="Endpoint for other machines, such as tls/0.0.0.0:7447 (port 0: a free one; see `certs`); may"
-            " be repeated. A unix socket in the state folder is always listened on."
+            help="Endpoint for other machines, such as tls/0.0.0.0:7447 (see `certs`; port 0: a"
+            " free one); may be repeated. Default: only a socket in the state folder."
         ),
     ] = None,
     state: State = None,
@@ -66,8 +66,8 @@ def serve(
         str | None,
         typer.Option(
             metavar="ADDRESS",
-            help="Keep the rows in PostgreSQL: postgresql://USER@HOST/DATABASE, without a password (see ~/.pgpass)."
-            " Default: as the state folder says, SQLite for a new one.",
+            help="PostgreSQL database: postgresql://USER@HOST/DATABASE, with the password in"
+            " ~/.pgpass. Default: the state folder's; SQLite for a new one.",
         ),
     ] = None,
     seal_key: Annotated[
@@ -81,14 +81,15 @@ def serve(
     data: Annotated[
         Path | None,
         typer.Option(
-            help="Folder of split files (see `evopolicy data`); default: derived from a secret in the state folder."
+            help="Folder of split files (see `evopolicy data`); default: cases derived from a"
+            " secret in the state folder."
         ),
     ] = None,
     insecure_tcp: Annotated[
         bool,
         typer.Option(
             "--insecure-tcp",
-            help="Allow tcp/ beyond this machine, where tokens and results can be read on the wire.",
+            help="Allow tcp/ to other machines: tokens and results can then be read on the network.",
         ),
     ] = False,
     cluster: Annotated[str | None, typer.Option(help="Name of the cluster [local].")] = None,
@@ -99,8 +100,9 @@ def serve(
     hidden_isolation: Annotated[
         Literal["related", "strict", "off"],
         typer.Option(
-            help="Agents and train episodes beside which no hidden episode is played on a kernel. `related`:"
-            " those of runs that share a hidden case; `strict`: all; `off`: none, and run.json says `shared`."
+            help="Agents and train episodes that share no kernel with hidden episodes: those of"
+            " runs that share a hidden case (related), all (strict), or none (off; run.json"
+            " says `shared`)."
         ),
     ] = "related",
     hidden_wait: Annotated[
@@ -108,8 +110,8 @@ def serve(
         typer.Option(
             min=0.0,
             metavar="SECONDS",
-            help="After hidden episodes of closed runs have waited for this time, one machine starts no"
-            " related agent until they are played.",
+            help="After hidden episodes of closed runs have waited this long, one machine starts"
+            " no related agent until they are played.",
         ),
     ] = CoreSettings().hidden_wait_s,
     agent_wait: Annotated[
@@ -117,16 +119,17 @@ def serve(
         typer.Option(
             min=0.0,
             metavar="SECONDS",
-            help="Cancel a run that is still open this long after its agent's start, if hidden episodes of"
-            " closed runs wait for the agent. Choose more than the longest wall limit of your agents.",
+            help="Cancel a run that is open this long after its agent's start, if hidden episodes"
+            " of closed runs wait for the agent. Choose more than your agents' longest wall"
+            " limit.",
         ),
     ] = CoreSettings().agent_wait_s,
     metrics: Annotated[
         str | None,
         typer.Option(
             metavar="HOST:PORT",
-            help="Serve /metrics in Prometheus' text format, and /healthz. They need no token and contain"
-            " nothing about single runs.",
+            help="Serve Prometheus' /metrics, and /healthz, without a token. They contain nothing"
+            " about single runs.",
         ),
     ] = None,
     ready_file: Annotated[
@@ -157,16 +160,14 @@ def serve(
     ] = None,
     trust_workers: Annotated[
         bool,
-        typer.Option(
-            "--trust-workers", help="Accept all environments that workers announce, also unapproved ones."
-        ),
+        typer.Option("--trust-workers", help="Accept unapproved environments that workers announce."),
     ] = False,
     _: Version = False,
 ) -> None:
     """Run the coordinator of a cluster.
 
-    Workers and gateways connect to it with the credentials that it writes. After SIGTERM or Ctrl-C it makes everything
-    durable and exits; when it is started again on the same folder, it continues.
+    Workers and gateways connect to it with the credentials that it writes. It exits after SIGTERM or Ctrl-C, and
+    continues when it is started again on the same folder.
     """
     if context.invoked_subcommand is not None:
         return
@@ -201,9 +202,8 @@ def backup(
 ) -> None:
     """Copy the state folder: a consistent database, blobs and keys. The coordinator may be running.
 
-    To restore: stop the coordinator, copy the backup to where its state was, start it again. Workers and gateways
-    reconnect by themselves; episodes that came in after the backup are played again. Keep backups as private as the
-    state: they hold the hidden cases.
+    To restore: stop the coordinator, put the backup in place of its state, start it again. Later episodes are then
+    played again. Keep backups as private as the state: they hold the hidden cases.
     """
     copied = back_up(state or default_state_dir(), target)
     say(f"{copied.path}: database and {counted(copied.blobs, 'blob')}, {copied.bytes:,} bytes")

@@ -61,7 +61,7 @@ def router_config(
     ] = None,
     uplink: Annotated[
         str,
-        typer.Option(help="Name in the certificate of that endpoint: coordinator, or router/NAME."),
+        typer.Option(help="Name in that endpoint's certificate: coordinator, or router/NAME."),
     ] = certs.COORDINATOR,
     admit: Annotated[
         list[str] | None,
@@ -75,7 +75,7 @@ def router_config(
 ) -> None:
     """Write the configuration and passwords of a site's Zenoh router, from the coordinator's access rules.
 
-    Write it again, and restart zenohd, whenever a machine of the site is issued or revoked.
+    Repeat this, and restart zenohd, whenever a machine of the site is issued or revoked.
     """
     root = state or default_state_dir()
     upstream = tuple(connect or (first_endpoint(root),))

@@ -143,7 +143,7 @@ def cancel(run: RunId, connect: Connect = None, file: CredentialsFile = None) ->
 
 @runs_app.command("agent-gone", epilog="Example: evopolicy runs agent-gone r-0f2e9a7c11d04b35")
 def agent_gone(run: RunId, connect: Connect = None, file: CredentialsFile = None) -> None:
-    """Vouch that a run's agent has ended, after its machine was lost for good.
+    """Vouch that a run's agent has ended, because its machine is lost for good.
 
     The cluster may then play hidden cases on that machine. If the agent is still alive, it could learn them: when in
     doubt, resume the run or restart the machine.

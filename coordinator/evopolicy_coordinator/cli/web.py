@@ -34,7 +34,7 @@ def web(
     runs: Annotated[
         list[Path] | None,
         typer.Argument(
-            help="Run directories, folders of sweeps, or folders that contain them; default: runs.",
+            help="Run directories, sweeps, or folders that contain them; default: runs.",
             show_default=False,
         ),
     ] = None,
@@ -54,8 +54,7 @@ def web(
     token_file: Annotated[
         Path | None,
         typer.Option(
-            help="File that keeps the token, mode 0600, so that browsers stay signed in after a restart;"
-            " default: a new token.",
+            help="File (mode 0600) that keeps the token across restarts; default: a new token each time.",
             show_default=False,
         ),
     ] = None,
@@ -68,9 +67,9 @@ def web(
 ) -> None:
     """Show sweeps, runs and the cluster in a browser, live.
 
-    Prints an address with a token, which is needed on this machine too. Without --connect and --credentials it asks
-    this machine's own coordinator, if one answers, and else shows the folders alone. Hidden scores of a run appear when
-    no agent of a related run is alive.
+    Prints an address with a token, which is needed on this machine too. Without --connect and --credentials it also
+    shows this machine's coordinator, if one answers. Hidden scores of a run appear when no agent of a related run is
+    alive.
     """
     setup_logging("warning")
     # Here, not above: it needs starlette and jinja2, and `evopolicy` loads this module to list its commands.

@@ -47,7 +47,7 @@ def accept_worlds(
         typer.Argument(metavar="[ENV]...", help="Environments of Core16, or globs. Default: all of them."),
     ] = None,
     policies: Annotated[
-        Path, typer.Option(help="Folder of the canonical policies, each in the folder of its environment.")
+        Path, typer.Option(help="Folder with a folder of canonical policies for each environment.")
     ] = Path("examples/policies"),
     state: State = None,
 ) -> None:

@@ -84,7 +84,7 @@ TEXTS: Mapping[str, str | Callable[..., str]] = {
     ),
     "busy": "submit {submit} is still running; one runs at a time",
     "key_used": "key {key!r} was used for submit {submit} with another request",
-    "no_bundle": "a submit names a bundle, or says why there is none",
+    "no_bundle": "a submit needs a bundle, or the reason why it has none",
     "unknown_submit": "run {run!r} has {n} submits, none of index {submit}",
     "unknown_case": "env_instances names {case}; train cases are 0 to {last}",
     "too_few": "{n} episodes asked for; a submit takes at least {least}",

@@ -213,7 +213,7 @@ class RunRequests:
 
     def _check_again(self, m: operator.Evaluate, n: int) -> None:
         """Checks that a request to replay episodes is consistent, and that its recordings are stored."""
-        text = f"{len(m.replays)} recordings for {n} cases; one for each is needed, and no bundle beside them"
+        text = f"{len(m.replays)} recordings for {n} cases; each case needs one, and no bundle may come with them"
         require(not m.replays or (m.bundle is None and len(m.replays) == n), Refusal.BAD_MESSAGE, text)
         for ref in m.replays:
             check_stored(self._blobs, ref)

@@ -127,7 +127,7 @@ class Access:
         if elsewhere or (origin is not None and not same):
             return 403, "The request comes from another site's page."
         if method not in ("GET", "HEAD") and not same and headers.get("authorization") is None:
-            return 403, "The request does not tell its origin."
+            return 403, "The request has no origin."
         return None
 
 

@@ -328,7 +328,7 @@ class Site:
 
 async def _failed(request: Request, error: Exception) -> Response:
     log.error("request failed", path=request.url.path[:200], exc_info=error)
-    return PlainTextResponse("The view failed at this page. Its log tells why.\n", 500)
+    return PlainTextResponse("The view failed at this page. Its log has the reason.\n", 500)
 
 
 def report_policy() -> str:

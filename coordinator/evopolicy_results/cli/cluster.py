@@ -30,7 +30,7 @@ Local = Annotated[
 State = Annotated[
     Path | None,
     typer.Option(
-        help="With --local: the state folder of the runs; default: the one that `evopolicy local` uses.",
+        help="With --local: the runs' state folder; default: that of `evopolicy local`.",
         rich_help_panel=CLUSTER,
     ),
 ]
@@ -42,7 +42,7 @@ _SHOWN = 20
 
 def first(lines: Sequence[str]) -> list[str]:
     """The first lines of a list, and how many more there are."""
-    more = [f"… and {len(lines) - _SHOWN} more (--json tells all)"] if len(lines) > _SHOWN else []
+    more = [f"… and {len(lines) - _SHOWN} more (--json lists all)"] if len(lines) > _SHOWN else []
     return [*lines[:_SHOWN], *more]
 
 

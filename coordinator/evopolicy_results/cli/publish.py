@@ -50,9 +50,7 @@ def publish(
     file: CredentialsFile = None,
     local: Local = False,
     state: State = None,
-    with_logs: Annotated[
-        bool, typer.Option("--with-logs", help="Publish the agents' logs too, with the same removals.")
-    ] = False,
+    with_logs: Annotated[bool, typer.Option("--with-logs", help="Publish the agents' logs too.")] = False,
     remove_findings: Annotated[
         bool,
         typer.Option("--remove-findings", help="Leave out policies and recordings that hold keys or tokens."),
@@ -61,17 +59,17 @@ def publish(
         list[str] | None,
         typer.Option(
             metavar="FILE:LINE",
-            help="Publish this line as it is, though it looks like a secret; may be repeated.",
+            help="Publish this line although it looks like a secret; may be repeated.",
         ),
     ] = None,
     licence: Annotated[
-        str, typer.Option(help="Licence of the file, such as CC-BY-4.0, for its card.", show_default=False)
+        str, typer.Option(help="Licence of the file, such as CC-BY-4.0.", show_default=False)
     ] = "",
     card: Annotated[
         Path | None,
         typer.Option(
             metavar="FOLDER",
-            help="Also write the evaluation card and a Croissant description of the file into this folder.",
+            help="Also write an evaluation card and a Croissant description into this folder.",
         ),
     ] = None,
     as_json: Json = False,
@@ -126,15 +124,15 @@ def check(
     replay: Annotated[
         str | None,
         typer.Option(
-            metavar="SHARE", help="Replay recorded actions: `5%` of the episodes, drawn at random, or `all`."
+            metavar="SHARE", help="Replay the recorded actions of `all` episodes, or of a random share: `5%`."
         ),
     ] = None,
     policies: Annotated[
         str | None,
         typer.Option(
             metavar="SHARE",
-            help="Also play policies that declare themselves deterministic, in the sandbox, and compare their actions:"
-            " `5%` of the episodes, or `all`.",
+            help="Also play policies that declare themselves deterministic, in the sandbox:"
+            " `all`, or a share.",
         ),
     ] = None,
     policy_package: Annotated[
@@ -142,18 +140,17 @@ def check(
         typer.Option(
             "--policy-package",
             metavar="NAME",
-            help="With --policies: package that policies may import besides numpy, where their run names it; may be"
-            " repeated.",
+            help="With --policies: package that policies may import if their run names it; may be repeated.",
         ),
     ] = None,
     identity: Annotated[
-        str | None, typer.Option(help="Public key of the expected signer, from another source than the file.")
+        str | None, typer.Option(help="The expected signer's public key, from another source than the file.")
     ] = None,
     head: Annotated[
         list[str] | None,
         typer.Option(
             metavar="HEAD",
-            help="Head of the journal that you noted earlier: 64 hexadecimal digits, or a file written by"
+            help="Earlier head of the journal: 64 hexadecimal digits, or a file of"
             " `evopolicy-coordinator countersign`; may be repeated.",
         ),
     ] = None,
@@ -161,9 +158,9 @@ def check(
 ) -> None:
     """Check published results.
 
-    Checks signature, digests, commitments, journal, selection and scores; with --replay also the recorded episodes.
-    Executes nothing of the file, except policies in the sandbox with --policies. Exit codes: 0 no contradiction, 1 a
-    contradiction, 2 wrong usage or no such file, 3 a replay was not possible, or some episodes have no recording.
+    Checks signature, digests, commitments, journal, selection and scores. Executes nothing of the file, except
+    policies in the sandbox with --policies. Exit codes: 0 no contradiction, 1 a contradiction, 2 wrong usage, 3 some
+    episodes could not be replayed.
     """
     if identity is not None and not re.fullmatch(r"[0-9a-fA-F]{64}", identity):
         fail(

@@ -45,8 +45,8 @@ def report(
     runs: Annotated[
         list[Path],
         typer.Argument(
-            help="Run directories, or folders that contain them. A CSV of held-out returns"
-            " (entry,harness,<environment>,…) adds entries without runs."
+            help="Run directories, folders of them, or a CSV of held-out returns of other agents"
+            " (entry,harness,<environment>,…)."
         ),
     ],
     out: Annotated[Path, typer.Option(help="Folder to write; a new one, or an earlier report's.")],
@@ -54,15 +54,14 @@ def report(
         str | None,
         typer.Option(
             metavar="NAME",
-            help="Use the held-out scores of this re-score of `evopolicy rescore`; the report labels them post hoc.",
+            help="Use the held-out scores of this re-score, labelled as post hoc.",
         ),
     ] = None,
     allow_mixed: Annotated[
         bool,
         typer.Option(
             "--allow-mixed",
-            help="Compare runs with different budgets, policy scopes, splits, fingerprints, jails or hidden isolation;"
-            " the report says so.",
+            help="Compare runs although their settings or fingerprints differ; the report says so.",
         ),
     ] = False,
     as_json: Json = False,

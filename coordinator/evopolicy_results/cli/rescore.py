@@ -46,14 +46,12 @@ def rescore(
         typer.Option(
             min=1,
             max=10_000,
-            help="Number of new hidden cases. The coordinator derives them from its secret.",
+            help="Number of new hidden cases, derived from the coordinator's secret.",
         ),
     ] = None,
     data: Annotated[
         Path | None,
-        typer.Option(
-            help="Take the held-out cases of this folder of split files instead; with --cases, the first ones."
-        ),
+        typer.Option(help="Folder of split files with the held-out cases; with --cases, the first ones."),
     ] = None,
     all_checkpoints: Annotated[
         bool,
@@ -62,8 +60,8 @@ def rescore(
     name: Annotated[
         str | None,
         typer.Option(
-            help="Name of the re-score; runs have the same new cases under the same name. Default: cases-N, or the"
-            " data folder's name."
+            help="Name of the re-score: the same name gives the same new cases. Default: cases-N,"
+            " or the data folder's name."
         ),
     ] = None,
     connect: Connect = None,
@@ -74,10 +72,9 @@ def rescore(
 ) -> None:
     """Play checkpoints of finished runs on further hidden cases, for tighter intervals.
 
-    Writes rescore/NAME.json beside run.json, which stays as it is. A re-score is post hoc: it never changes which
-    checkpoint was selected. `evopolicy report --scores NAME` uses it. Repeat an interrupted command to continue it.
-    Exit codes: 0 all re-scored, 1 the cluster failed, 2 wrong usage or no run can be re-scored, 3 some runs cannot be
-    re-scored.
+    Writes rescore/NAME.json, for `evopolicy report --scores NAME`. A re-score is post hoc: it never changes run.json
+    or the selected checkpoint. Repeat an interrupted command to continue it. Exit codes: 0 all re-scored, 1 the
+    cluster failed, 2 wrong usage or no run can be re-scored, 3 some runs cannot.
     """
     if cases is None and data is None:
         fail("name the new cases: --cases 256 for their number, or --data FOLDER for split files")

@@ -40,7 +40,7 @@ app = App(name="verify")
 def verify(
     run: Annotated[Path, typer.Argument(metavar="RUN_DIR", help="A finished run's directory.")],
     sample: Annotated[
-        int | None, typer.Option("--sample", min=1, help="Number of episodes, drawn at random; default: all.")
+        int | None, typer.Option("--sample", min=1, help="Number of random episodes; default: all.")
     ] = None,
     connect: Connect = None,
     file: CredentialsFile = None,
@@ -49,7 +49,7 @@ def verify(
     data: Annotated[
         Path | None,
         typer.Option(
-            help="With --local: the folder of split files that the run was made with.",
+            help="With --local: the run's folder of split files.",
             rich_help_panel=CLUSTER,
         ),
     ] = None,
@@ -57,10 +57,10 @@ def verify(
 ) -> None:
     """Replay a run's recorded actions, and compare rewards, observations and returns bit for bit.
 
-    Also checks all other numbers of the run directory against each other, and against the coordinator's own result if
-    it has the run. Without that coordinator, edits that agree with each other are found only where a train episode
-    shows them. Returns of re-scores (rescore/NAME.json) are not played again. Exit codes: 0 identical, 1 something
-    differs, 2 wrong usage or other cases than the run's, 3 could not be checked, or not all of it.
+    Also compares the other numbers of the run directory with each other, and with the result of the run's
+    coordinator. Without that coordinator, consistent edits are found only where a train episode shows them. Re-scores
+    are not played again. Exit codes: 0 identical, 1 something differs, 2 wrong usage or other cases than the run's, 3
+    not all could be checked.
     """
     where = Where(connect, file, local, state, data, runs=[run], needs_state=False)
     console = terminal(stderr=as_json)

@@ -192,7 +192,7 @@ def tokens(study: Study, looks: Mapping[str, Look]) -> Plot | None:
         name="tokens",
         title="Tokens",
         caption="Tokens of a run by environment (symbols) and their mean (bars). Diagnostic: no part of a"
-        " score. Agents that tell nothing of tokens are absent.",
+        " score. Agents without token counts are absent.",
         alt=f"Token use of {len(entries)} agents in three kinds.",
         data=rows(counted),
         figure=figure,

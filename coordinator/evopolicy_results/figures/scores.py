@@ -29,6 +29,8 @@ from evopolicy_results.statistics.aggregates import TAUS, Bounded
 from evopolicy_results.studies.palette import REFERENCE, Look
 from evopolicy_results.studies.study import Study, Suite
 
+_LEFT = -1.0
+"""Least end of the overview's scale."""
 MAX_CURVES = 3
 """Maximum number of runs of one agent on one environment drawn separately; more are drawn as their mean and range."""
 
@@ -53,6 +55,8 @@ def overview(study: Study, looks: Mapping[str, Look]) -> Plot | None:
     entries = [
         entry for entry in looks if any(entry == one["entry"] for each in points.values() for one in each)
     ]
+    lowest = min(one["value"] for each in points.values() for one in each)
+    left = min(-0.25, max(_LEFT, lowest - 0.05))
     step = min(0.22, 0.8 / max(1, len(entries)))
     height = 1.1 + sum(0.26 if line not in points else 0.16 + 0.13 * len(entries) for line in lines)
     names = [title_of(line) if line in points else line for line in lines]
@@ -68,12 +72,15 @@ def overview(study: Study, looks: Mapping[str, Look]) -> Plot | None:
                 panel.hlines(
                     place + shift, one["low"], one["high"], color=look.colour, linewidth=1.3, alpha=0.7
                 )
-                panel.plot(one["value"], place + shift, look.marker, color=look.colour, markersize=5.0)
+                panel.plot(
+                    max(left, one["value"]), place + shift, look.marker, color=look.colour, markersize=5.0
+                )
         for label, line in zip(panel.get_yticklabels(), lines, strict=True):
             label.set_fontweight("normal" if line in points else "bold")
-        panel.set_xlim(-0.25, 1.25)
+        panel.set_xlim(left, 1.25)
         panel.set_xticks([0.0, 0.5, 1.0], ["random", "0.5", "best agent"])
         legend_above(figure, handles_of(entries, looks))
+    cut = any(one["low"] < left or one["high"] > 1.25 for each in points.values() for one in each)
     missing = [
         title_of(env) for suite in study.suites for env in suite.table.environments if env not in points
     ]
@@ -81,6 +88,8 @@ def overview(study: Study, looks: Mapping[str, Look]) -> Plot | None:
         name="overview",
         title="Score by environment",
         caption="Held-out mean and 95 % interval, on each environment's scale from random actions to the best agent."
+        + (" Intervals that reach an edge continue." if cut else "")
+        + (" Scores at the left edge lie beyond it." if lowest < left else "")
         + (f" Without a scale, as no agent beats random actions: {', '.join(missing)}." if missing else ""),
         alt=f"Scores of {len(entries)} agents on {len(points)} environments between random actions and the best agent.",
         data=[one for each in points.values() for one in each],

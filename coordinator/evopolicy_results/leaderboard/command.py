@@ -42,21 +42,22 @@ def leaderboard(
         list[str] | None,
         typer.Option(
             metavar="KEY[=NAME]",
-            help="Public key of a signer, from another source than the file, and the name of the lab; may be repeated.",
+            help="Public key of a signer, from another source than the file, and the lab's name;"
+            " may be repeated.",
         ),
     ] = None,
     replay: Annotated[
         str | None,
         typer.Option(
             metavar="SHARE",
-            help="Replay recorded actions of each file: `5%` of the episodes, drawn at random, or `all`.",
+            help="Replay the recorded actions of `all` episodes, or of a random share of each file: `5%`.",
         ),
     ] = None,
 ) -> None:
     """Write a leaderboard of several labs' published results as a static site.
 
-    Checks each file first. Files that fail are listed with the reason and not ranked. Results that cannot be compared
-    get separate tables.
+    Files that fail their check are listed with the reason, not ranked. Results that cannot be compared get separate
+    tables.
     """
     labs: dict[str, str] = {}
     for each in identity or ():

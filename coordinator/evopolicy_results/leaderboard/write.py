@@ -181,7 +181,9 @@ def _board(board: Board, study: Study, number: int, folder: str) -> dict[str, An
     elif board.mixed:
         reasons_title = "The runs of this file are no fair comparison; they differ in"
     elif board.apart:
-        reasons_title = "These files stand apart: beside the first board their runs differ in"
+        reasons_title = (
+            "These files are on a board of their own: their runs differ from those of the first in"
+        )
     return section(
         f"board-{number}",
         name,

@@ -28,7 +28,7 @@ KINDS = {
     "journal": "the journal's entries are complete and in order",
     "commitment": "splits and settings are those that were fixed before the agent began",
     "disclosure": "the journal says that the cases were made public",
-    "record": "run.json tells what was committed to and what came of it",
+    "record": "run.json agrees with commitment and result",
     "result": "the result is the one that the journal fixed when the run ended",
     "budget": "submits keep to budget and bounds",
     "selection": "the selected checkpoint is the one with the best validation mean",

@@ -127,7 +127,7 @@ async def _replayed(
         before, again = recording_of(recorded[index]), await evaluations.recording(outcome)
         fault = compare.first_difference(before, again)
         if fault is None and not compare.same(told, outcome.episode_return):
-            fault = f"return {told!r} is told, {outcome.episode_return!r} came"
+            fault = f"return {told!r} is recorded, {outcome.episode_return!r} was played"
         if fault is not None:
             yield f"{place}: {fault}", rounded(before, again)
 
@@ -341,7 +341,7 @@ async def unplayable(evaluations: Evaluations, run: PublishedRun) -> tuple[str, 
     except BrokenEnvironmentError as error:
         return str(error), False
     if not state.fingerprints:
-        return f"no worker of this machine offers {env}; `evopolicy-worker check-env {env}` tells why", False
+        return f"no worker of this machine offers {env}; `evopolicy-worker check-env {env}` shows why", False
     offered, *_ = await evaluations.ask.environments()
     if any(each.description.env == env and not each.description.deterministic for each in offered):
         return f"{env} is marked as not deterministic: the same actions can give another episode", False

@@ -103,7 +103,7 @@ def _manifest(files: Files, identity: str, checked: Checked) -> Manifest | None:
     checked.add("signature", "ok", f"signed by {signature.key}")
     if not identity:
         text = (
-            "self-signed: whoever made the file chose the key. Name the key that you expect with --identity"
+            "self-signed: the maker of the file chose the key. Name the key that you expect with --identity"
         )
         checked.add("identity", "open", text)
     elif signature.key == identity.lower():

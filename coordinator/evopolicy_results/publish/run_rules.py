@@ -99,9 +99,7 @@ def check_starts(checked: Checked) -> None:
         for condition in Line.__struct_fields__:
             told, fixed = getattr(start.line, condition), getattr(least, condition)
             if told not in ("unknown", fixed):
-                text = (
-                    f"its start tells {condition} {told!r} of the runs before; run {start.run} had {fixed!r}"
-                )
+                text = f"its start records {condition} {told!r} of the runs before; run {start.run} had {fixed!r}"
                 checked.add("commitment", "failed", text, name)
 
 
@@ -123,7 +121,7 @@ def _commitment(run: PublishedRun, history: History) -> Iterator[str | Fault]:
         yield Fault("journal", f"it starts from run {entry.start.run}, of which the journal has no entry")
     fixed = (entry.commitment, number, history.heads[number], entry.epoch)
     if place is None or (place.commitment, place.opened, place.opened_head, place.epoch) != fixed:
-        yield Fault("record", "run.json tells another commitment or head of the journal than the journal has")
+        yield Fault("record", "run.json has another commitment or head of the journal than the journal has")
     if of := settings.replay_of or entry.replay_of:
         yield f"it is a replay of run {of}, and no run of its own"
     if repeated := overlaps({split: run.cases(split) for split in SPLITS}):
@@ -147,7 +145,7 @@ def _result(run: PublishedRun, history: History) -> Iterator[str | Fault]:
     if run.result.status != entry.status:
         yield f"it ended as {entry.status}, not as {run.result.status}"
     if place is None or (place.ended, place.ended_head) != (number, history.heads[number]):
-        yield Fault("record", "run.json tells another end of the run than the journal has")
+        yield Fault("record", "run.json has another end of the run than the journal has")
 
 
 _RECORD_AS_SET = "env model exp_id repeat attempt sandbox_tier start replay_of"
@@ -209,7 +207,7 @@ def _record(run: PublishedRun, history: History) -> Iterator[str]:
 def _unlike(told: Iterable[tuple[str, Any, Any]], source: str) -> Iterator[str]:
     for name, here, fixed in told:
         if here != fixed:
-            yield f"run.json tells {name} {short(here)}; {source} {short(fixed)}"
+            yield f"run.json has {name} {short(here)}; {source} {short(fixed)}"
 
 
 def _budget(run: PublishedRun, history: History) -> Iterator[str]:
@@ -227,7 +225,7 @@ def _budget(run: PublishedRun, history: History) -> Iterator[str]:
             yield f"submit {submit.submit_index} plays a case that is not one of train"
     if used != result.budget_used or used > opening.budget:
         told, granted = result.budget_used, opening.budget
-        yield f"its submits take {used} episodes, {told} are told, {granted} were granted"
+        yield f"its submits take {used} episodes, {told} are recorded, {granted} were granted"
 
 
 def _selection(run: PublishedRun, history: History) -> Iterator[str]:
@@ -241,7 +239,7 @@ def _selection(run: PublishedRun, history: History) -> Iterator[str]:
     }
     wanted = best_validated(eligible, run.opening.settings.profile)
     if result.status == "completed" and result.best_submit_index != wanted:
-        yield f"submit {result.best_submit_index} is told, submit {wanted} has the best validation mean"
+        yield f"submit {result.best_submit_index} is recorded as selected, submit {wanted} has the best validation mean"
 
 
 def _scores(run: PublishedRun, history: History) -> Iterator[str]:
@@ -280,7 +278,7 @@ def _scores(run: PublishedRun, history: History) -> Iterator[str]:
             group = groups.get(contents.group_name(split, best))
             failed = sum(episode.failure != "" for episode in group.episodes) if group else 0
             if group and failed != result.policy_failures.get(split, 0):
-                yield f"{group.name} has {failed} failures of the policy, which the result does not tell"
+                yield f"{group.name} has {failed} failures of the policy, which the result does not count"
     if result.status == "completed":
         n_heldout = len(result.heldout_returns)
         if n_heldout != len(opening.heldout) or result.final_score != mean(result.heldout_returns):
@@ -381,9 +379,9 @@ def recording_fault(episode: contents.Episode, data: bytes) -> str | None:
         return str(error)
     total = return_of(recording)
     if not same(total, episode.episode_return):
-        return f"its rewards come to {total!r}, told is {episode.episode_return!r}"
+        return f"its rewards sum to {total!r}, its return is {episode.episode_return!r}"
     if recording.n != episode.length:
-        return f"it has {recording.n} steps, told are {episode.length}"
+        return f"it has {recording.n} steps, its length is {episode.length}"
     return None
 
 
@@ -451,8 +449,8 @@ def _metrics(run: PublishedRun, policies: dict[int, Bundle], checked: Checked) -
             pairs += [(where, here.get(name), value) for name, value in own.items() if name not in parsed]
             pairs.append((where, sorted(here), sorted(own)))
     except (AttributeError, KeyError, TypeError, ValueError):
-        yield "run.json tells metrics of code in another form than the software"
+        yield "run.json has metrics of code in another form than the software"
         return
     for name, here, fixed in pairs:
         if contents.document(here) != contents.document(fixed):
-            yield f"run.json tells {name} {short(here)}; the policies give {short(fixed)}"
+            yield f"run.json has {name} {short(here)}; the policies give {short(fixed)}"

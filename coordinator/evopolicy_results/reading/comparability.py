@@ -69,7 +69,7 @@ def _named(mixtures: Sequence[Mixture]) -> Iterator[str]:
             yield f"    and {more} more values"
 
 
-UNKNOWN_ISOLATION = "hidden isolation, where some runs do not tell it,"
+UNKNOWN_ISOLATION = "hidden isolation, which some runs do not record,"
 """Runs without this record, such as those of the published software, beside runs with it."""
 
 

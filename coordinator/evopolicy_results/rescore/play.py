@@ -186,7 +186,7 @@ async def class_of(record: RunRecord, evaluations: Evaluations) -> str:
     if not state.fingerprints:
         remedy = f"start one with --env {record.env}"
         if evaluations.ask.own:
-            remedy = f"`evopolicy-worker check-env {record.env}` tells why"
+            remedy = f"`evopolicy-worker check-env {record.env}` shows why"
         raise ConfigError(f"no worker of this cluster offers {record.env}; {remedy}")
     differences: list[str] = []
     for number, fingerprint in enumerate(state.fingerprints):

@@ -14,6 +14,7 @@ from evopolicy_results.reading.records import Run
 from evopolicy_results.scoring.scores import Cell
 from evopolicy_results.statistics.digits import decimals, rounded, valued
 from evopolicy_results.statistics.pairs import Pair
+from evopolicy_results.statistics.standings import RankEstimate
 from evopolicy_results.studies.study import Study, Suite
 
 _NAMED = 6
@@ -87,11 +88,10 @@ def _of_ranks(suite: Suite) -> Leader:
         return Leader(suite=suite.title, entry="", lead=why, apart="")
     first = agents[0]
     own = estimates.of(first.entry)
-    ends = (None, None) if own is None else (own.score_low, own.score_high)
-    scored = Estimate(value=first.score or 0.0, low=ends[0], high=ends[1])
-    lead = f"mean rank score {valued(scored)}"
+    lead = f"mean rank score {_scored(first.score, own)}"
     if len(agents) > 1:
-        lead += f", before {agents[1].entry} with {rounded(agents[1].score or 0.0, decimals(*ends) or 2)}"
+        second = agents[1]
+        lead += f", before {second.entry} with {_scored(second.score, estimates.of(second.entry))}"
     lead += f"; first on {first.wins} of {counted(first.n_environments, 'environment')}."
     if own is None:
         return Leader(
@@ -103,6 +103,16 @@ def _of_ranks(suite: Suite) -> Leader:
         if (other := estimates.of(row.entry)) is None or set(own.ties) & set(other.ties)
     ]
     return Leader(suite=suite.title, entry=first.entry, lead=lead, apart=_apart(tied, len(agents) - 1))
+
+
+def _scored(score: float | None, estimate: RankEstimate | None) -> str:
+    """A rank score with its interval."""
+    value = score or 0.0
+    if estimate is None:
+        return rounded(value, 2)
+    if decimals(estimate.score_low, estimate.score_high) is None:
+        return f"{rounded(value, 2)} (in all resamples)"
+    return valued(Estimate(value=value, low=estimate.score_low, high=estimate.score_high))
 
 
 def _of_returns(suite: Suite) -> Leader:

@@ -392,7 +392,7 @@ def _diagnostics(study: Study) -> list[Table]:
                 millions("cache", "Cache (M)", "Cache read plus cache creation."),
                 millions("output", "Out (M)", "Output, reasoning included."),
                 Column("cost", "Cost (US$)", "number", digits=2),
-                Column("runs", "Runs that tell", "integer", of="n_runs"),
+                Column("runs", "Runs with counts", "integer", of="n_runs"),
                 Column("metering", "Counted by", of=lambda row: row.metering or None),
                 Column(
                     "hosted_tools",

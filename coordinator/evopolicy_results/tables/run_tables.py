@@ -127,7 +127,7 @@ def _agents(runs: Iterable[Run]) -> Table:
     return Table(
         name="agents",
         title="Agents",
-        caption="How each agent was set up, as its run directories tell; an agent with several rows was not"
+        caption="How each agent was set up, as its run directories record it; an agent with several rows was not"
         " the same in all of its runs.",
         columns=(*setup, RUNS),
         rows=tuple(

@@ -27,7 +27,7 @@ from evopolicy_results.tables.table import (
 
 _SHOWN_TAUS = (0.1, 0.25, 0.5, 0.75, 0.9)
 ENVIRONMENTS = Column("environments", "Environments", "integer", of="n_environments")
-OVER = Column("over", "Over", note="What a repetition would draw anew: cases, runs, or runs and cases.")
+OVER = Column("over", "Over", note="Drawn anew in a repetition: cases, runs, or runs and cases.")
 
 
 def statistics_tables(suite: Suite) -> list[Table]:
@@ -73,7 +73,7 @@ def statistics_tables(suite: Suite) -> list[Table]:
                 *itertools.chain(*map(_above, _SHOWN_TAUS)),
                 ENVIRONMENTS,
                 RUNS,
-                Column("over", "Over", note="What the bootstrap draws anew."),
+                Column("over", "Over", note="Drawn anew by the bootstrap."),
             ),
             results.aggregates,
             "How good is a typical run of each agent? Over the normalised scores of single runs, not clipped, on"

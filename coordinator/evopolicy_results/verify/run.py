@@ -178,7 +178,7 @@ class Verifier:
         is_whole = len(returns) == len(played.env_instances)
         if is_whole and played.mean is not None and mean(returns) != played.mean:
             name = f"submit {played.submit_index}, {played.split}"
-            self.report.differs(name, f"run.json tells a mean of {played.mean!r}")
+            self.report.differs(name, f"run.json has a mean of {played.mean!r}")
 
     async def play_policy(self, played: EpisodeList, indexes: Sequence[int]) -> None:
         """Makes the advisory check of these train episodes with their checkpoint's policy. Call it right after their
@@ -296,9 +296,9 @@ def _differences(
     if recording.has_files and (fault := _of_files(played, index, stored or replayed, actions=bool(stored))):
         yield f"the feedback files: {fault}"
     if played.returns is not None and not compare.same(played.returns[index], again.episode_return):
-        yield f"return {played.returns[index]!r} is told, {again.episode_return!r} came"
+        yield f"return {played.returns[index]!r} is recorded, {again.episode_return!r} was played"
     if played.lengths is not None and played.lengths[index] != again.length:
-        yield f"{played.lengths[index]} steps are told, {again.length} came"
+        yield f"{played.lengths[index]} steps are recorded, {again.length} were played"
     if summary is None:
         return
     pairs: list[tuple[str, Any, Any]] = []
@@ -312,7 +312,7 @@ def _differences(
             pairs.append(("success", solved[index], then.success))
     for what, told, came in pairs:
         if told != came:
-            yield f"{what} {told!r} is told, {came!r} came"
+            yield f"{what} {told!r} is recorded, {came!r} was played"
 
 
 def _of_files(played: EpisodeList, index: int, episode: Trajectory, *, actions: bool) -> str | None:

@@ -108,7 +108,7 @@ def document() -> str:
     """docs/explanation/hostile-policies.md: the corpus as a table of verdicts, inside the text of `document.md`."""
     rows = []
     for probe in PROBES:
-        first = (POLICIES / f"{probe.name}.py").read_text().split('"""')[1].rstrip(".")
+        first = (POLICIES / f"{probe.name}.py").read_text().split('"""')[1].partition(":")[0].rstrip(".")
         undefended = {"tier": "with tier `none`", "sealed": "unsealed"}
         off = "-" if probe.off is None else undefended["sealed" if "sealed" in probe.off else "tier"]
         rows.append((first, "no access; the episode continues", off))
@@ -131,11 +131,16 @@ def document() -> str:
         ),
         ("a packed bundle with compiled code", "the worker refuses it", "by a plain write"),
     ]
-    groups: dict[tuple[str, str], list[str]] = {}
+    groups: dict[str, list[tuple[str, str]]] = {}
     for what, verdict, off in rows:
-        groups.setdefault((verdict, off), []).append(what)
-    lines = [f"| {verdict} | {off} | {'; '.join(attacks)} |" for (verdict, off), attacks in groups.items()]
-    table = "\n".join(["| verdict | succeeds without its defence | attacks |", "|---|---|---|", *lines])
+        groups.setdefault(verdict, []).append((what, off))
+    lines = [
+        f"| {verdict} | {len(attacks)} | {sum(off != '-' for _, off in attacks)} |"
+        f" {'; '.join(what.partition(':')[0] for what, _ in attacks[:3])} |"
+        for verdict, attacks in groups.items()
+    ]
+    head = "| verdict | attacks | of these, succeed without the defence | the first |\n|---|--:|--:|---|"
+    table = "\n".join([head, *lines])
     return Path(__file__).with_name("document.md").read_text().replace("{table}", table)
 
 

@@ -53,7 +53,7 @@ OWN = {
     "own says nothing": Agent(agents.SAYS_NOTHING, "completed", "silent", 1, SOON_SILENT),
     "own ids": Agent(agents.NOT_PUBLISHED_IDS, "no_ok_submit", "agent_stopped", 0),
 }
-"""The same without it: the table in docs/reference/protocol.md."""
+"""The same without it."""
 
 
 def published_tree(root: Path, n_train: int = 1024) -> Path:

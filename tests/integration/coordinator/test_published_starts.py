@@ -129,13 +129,13 @@ def test_a_start_that_is_denied_is_found(published: Path, how: str) -> None:
             forger.json(f"{name}/{contents.OPENING}", lambda opening: drop(opening, "settings"))
         case "record":
             forger.json(f"{name}/{contents.RUN}", drop)
-            kind, text = "record", "run.json tells start"
+            kind, text = "record", "run.json has start"
         case "conditions":
             line = {"jail": "bwrap", "sandbox_tier": "bwrap", "metering": "nothing"}
             forger.json(
                 f"{name}/{contents.OPENING}", lambda opening: opening["settings"]["start"].update(line=line)
             )
-            text = "its start tells jail 'bwrap' of the runs before"
+            text = "its start records jail 'bwrap' of the runs before"
         case _:
             forger.entries(lambda lines: [line for line in lines if b'"entry":"explorer"' not in line])
             kind, text = "journal", "of which the journal has no entry"

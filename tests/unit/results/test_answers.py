@@ -11,9 +11,11 @@ from invented.run_dirs import write_run
 from invented.study import write_suite
 
 from evopolicy_common.statistics.intervals import Estimate
+from evopolicy_results.figures.scores import overview
 from evopolicy_results.notebook import study, tables_of
-from evopolicy_results.statistics.digits import valued
+from evopolicy_results.statistics.digits import bounds_text, valued
 from evopolicy_results.studies.answers import answers_of
+from evopolicy_results.studies.palette import looks
 
 GOOD, BAD = (Version(policy(gain=gain), (-90.0,), -95.0) for gain in (1.0, 2.0))
 
@@ -43,10 +45,43 @@ def test_the_leader_of_a_suite_is_the_first_of_its_leaderboard(tmp_path: Path) -
     board = next(table for table in tables_of(found) if table.name == "leaderboard")
     rows = [row for row in board.rows if row["harness"] != "Uniform"]
     assert leader.entry == rows[0]["entry"]
+    second = found.suites[0].statistics.standings.of(rows[1]["entry"])
+    assert second is not None
+    interval = str(bounds_text(rows[1]["score"], second.score_low, second.score_high))
     assert f"before {rows[1]['entry']} with" in leader.lead
+    assert interval in leader.lead.partition("before")[2]
     tied = [row["entry"] for row in rows[1:] if set(row["ties"]) & set(rows[0]["ties"])]
     assert all(name in leader.apart for name in tied)
     assert leader.apart.startswith("Not told apart" if tied else "The difference to every other agent")
+
+
+def test_a_rank_score_that_no_resample_changes_says_so(tmp_path: Path) -> None:
+    for env in ("gym/acrobot", "gym/racing"):
+        for entry, level in (("Kestrel", -90.0), ("Tern", -300.0)):
+            versions = [Version(policy(gain=1.0), (level,), level)]
+            heldout = [level + case % 5 for case in range(32)]
+            write_run(tmp_path, versions, env=env, entry=entry, heldout=heldout, random_mean=-400.0)
+    (leader,) = answers_of(study([tmp_path])).leaders
+    assert leader.lead.startswith(
+        "mean rank score 1.00 (in all resamples), before Tern with 0.50 (in all resamples);"
+    )
+
+
+def test_an_agent_far_below_random_actions_is_in_the_picture(tmp_path: Path) -> None:
+    for entry, level in (("Kestrel", -90.0), ("Tern", -9000.0)):
+        heldout = [level + case % 5 for case in range(32)]
+        versions = [Version(policy(gain=1.0), (level,), level)]
+        write_run(tmp_path, versions, entry=entry, heldout=heldout, random_mean=-400.0)
+    found = study([tmp_path])
+    plot = overview(found, looks(found.entries, None))
+    assert plot is not None
+    assert plot.figure is not None
+    (panel,) = plot.figure.axes
+    left, right = panel.get_xlim()
+    shown = [x for line in panel.lines if line.get_marker() in ("o", "s") for x in line.get_xdata()]
+    assert len(shown) == 2
+    assert all(left <= x <= right for x in shown)
+    assert "lie beyond it" in plot.caption
 
 
 def test_on_one_environment_the_difference_has_its_own_interval(tmp_path: Path) -> None:

@@ -55,7 +55,7 @@ its episode."""
 _MAX_MESSAGE = 2000
 _MAX_TRACEBACK = 16_000
 _LIMITS: dict[str, tuple[FailureCategory, str, str]] = {
-    "memory": ("oom", "memory_bytes", "memory: {:,} bytes beside Python's own are the limit"),
+    "memory": ("oom", "memory_bytes", "memory: {:,} bytes besides Python's own are the limit"),
     "files": ("file_limit", "file_bytes", "files: {:,} bytes written are the limit"),
     "inodes": ("file_limit", "files", "files: {:,} files and folders are the limit"),
     "descriptors": ("file_limit", "open_files", "files: {} open descriptors are the limit"),
@@ -430,7 +430,7 @@ class PolicyProcess:
         large = endings.how(exit_.status) == "SIGKILL" and held > _LARGE_SHARE * limits.memory_bytes
         if large and ((counted := oom_kills()) is None or counted != self._oom_kills):
             text = (
-                f"the system ended the policy for want of memory: it held {held:,} bytes beside Python's own;"
+                f"the system ended the policy for want of memory: it held {held:,} bytes besides Python's own;"
                 f" {limits.memory_bytes:,} are the limit"
             )
             return Verdict("oom", text, limits.memory_bytes, held)

@@ -41,11 +41,11 @@ class TokenPaths(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
     output: str = ""
     reasoning: str = ""
     total: str = ""
-    """For a stream whose `output` excludes reasoning: output is then `total` minus `input`, if that is larger."""
+    """For a stream whose `output` excludes reasoning: output is `total` minus `input`, if larger."""
     input_includes_cached: bool = False
     """Whether the stream includes `cache_read` in `input`, as Codex does."""
     counts: Literal["turn", "session"] = "turn"
-    """Whether the numbers cover one turn, or the session so far."""
+    """Extent of the numbers."""
 
 
 class Events(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -74,14 +74,14 @@ class Cli(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
     first: tuple[str, ...]
     """Arguments of a session's first turn."""
     resume: tuple[str, ...] = ()
-    """Arguments of later turns; empty: the CLI has no sessions, and each turn starts from scratch."""
+    """Arguments of later turns; empty: the CLI has no sessions."""
     prompt: Literal["stdin", "argument"] = "stdin"
     """`argument`: the prompt replaces `{prompt}` in the arguments."""
     own_session_id: bool = False
-    """We generate the session's id (a UUID), and `{session}` passes it in `first` too."""
+    """evopolicy generates the session's id (a UUID), and `{session}` passes it in `first` too."""
     version: tuple[str, ...] = ("--version",)
     mcp: tuple[str, ...] = ()
-    """Arguments added where there are MCP servers; `{mcp_config}` is a file with `{"mcpServers": {…}}`."""
+    """Arguments added for MCP servers; `{mcp_config}` is a file with `{"mcpServers": {…}}`."""
     mcp_environment: dict[str, str] = {}
     """Variables in place of such arguments, filled in likewise."""
     events: Events = Events()
@@ -93,40 +93,38 @@ class AcpTable(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     auth: str = ""
     """Id of the login method to choose, where the agent wants one."""
     mode: str = ""
-    """Id of the session mode. Empty: the agent's own, or `default` in place of `auto`, in which a model of the agent's
-    decides about actions."""
+    """Id of the session mode. Empty: the agent's own, but `default` in place of `auto`."""
     counts: Literal["turn", "session"] = "turn"
-    """Whether the tokens that end a turn are those of the turn, or of the session so far."""
+    """Extent of the tokens that end a turn."""
 
 
 class ApiTable(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """The model's API, to which the relay passes requests on."""
 
     provider: ProviderName | None = None
-    """Chooses base URL, API and the variable with the key. None: a server at `base_url`."""
+    """Chooses base URL, API and key variable. None: a server at `base_url`."""
     api: ApiName | None = None
-    """OpenAI's Responses or Chat Completions, Anthropic's Messages, or Gemini's generateContent. None: the one of the
-    provider, and `chat` without one."""
+    """None: the provider's, else `chat`."""
     base_url: str = ""
-    """As the vendor's library takes it, such as `https://api.example.com/v1`; empty: the provider's own."""
+    """Such as `https://api.example.com/v1`; empty: the provider's."""
     insecure_http: bool = False
-    """Allows `http://` to a host of the local network, by which others may read prompts, answers and the key."""
+    """Allows `http://` on the local network, where others may read prompts, answers and the key."""
     key: str | None = None
-    """Name of the variable with the API key; None: the provider's, such as OPENAI_API_KEY; empty: none is needed."""
+    """Variable with the API key; None: the provider's, such as OPENAI_API_KEY; empty: no key."""
     key_header: str = ""
-    """Header with the key, such as `api-key` for Azure; empty: the protocol's own."""
+    """Header with the key, such as Azure's `api-key`; empty: the protocol's."""
     headers: dict[str, str] = {}
-    """Further headers of a company's gateway; each value is the name of a variable that holds the header's value."""
+    """Further headers; each value names a variable with the header's value."""
     query: dict[str, str] = {}
     """Added to each address, such as Azure's `api-version`."""
     parameters: dict[str, Any] = {}
-    """Only for the built-in agent, as all that follows: further fields of each request, such as `temperature`."""
+    """This and the following: only for the built-in agent. Further fields of each request, such as `temperature`."""
     system: str = ""
     """In place of the built-in system prompt."""
     max_output_tokens: Annotated[int, Meta(ge=1)] = 32_000
     """Of one answer; only with the API messages, which needs it."""
     context_tokens: Annotated[int, Meta(ge=1000)] = 180_000
-    """A conversation with more tokens is shortened: the outputs of earlier commands are left out."""
+    """A longer conversation loses the outputs of earlier commands."""
 
     @property
     def spoken(self) -> ApiName:
@@ -217,7 +215,7 @@ class AgentConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     models: Literal["any", "declared"] = "any"
     """`declared`: the relay refuses requests for other models than `model`."""
     hosted_tools: Literal["record", "refuse"] = "record"
-    """`refuse`: the relay refuses requests with tools that the provider runs, such as a search of the web."""
+    """`refuse`: the relay refuses requests with tools that the provider runs, such as a web search."""
     effort: str | None = None
     program: tuple[str, ...] = ()
     """Replaces the CLI on the PATH."""
@@ -225,43 +223,41 @@ class AgentConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     environment: dict[str, str] = {}
     pass_environment: tuple[str, ...] = ()
     provider: str | None = None
-    """Provider whose outage or quota pauses this agent; None: the harness's usual one."""
+    """Provider whose outage or quota pauses this agent; None: the harness's."""
     user_config: bool | tuple[str, ...] = False
-    """Gives the CLI a copy of the user's settings, rules, memory and login. Paths in `~/` name the files of a CLI whose
-    places evopolicy does not know."""
+    """Gives the CLI a copy of the user's settings, rules, memory and login; paths in `~/`, if evopolicy does not know
+    the CLI's."""
     retries: int = 5
     """Most retries in a row, for one turn."""
     backoff_s: float = 4.0
     """Seconds before the first retry; doubled for each further one."""
     reprompts: int = 8
-    """How often an agent that stops with budget left is prompted to continue."""
+    """Prompts to continue for an agent that stops with budget left."""
     silence_s: float = 3600.0
-    """A CLI without output for this many seconds is ended, and its session resumed."""
+    """Seconds without output after which a CLI is restarted in its session."""
     pause_s: float = 900.0
-    """First pause for an outage or a quota without a stated end, seconds; doubled up to an hour."""
+    """First pause for an outage or quota, seconds; doubled up to an hour."""
     max_pause_s: float = 86_400.0
-    """Limit of all pauses of a run together, seconds; after them the run ends."""
+    """Limit of all pauses of a run, seconds."""
     max_requests: Annotated[int, Meta(ge=1)] | None = None
-    """Limit per run of requests to the model; None: the usual one of `Limits`, as for `max_tokens`."""
+    """Limit per run of requests to the model; None: that of `Limits`."""
     max_tokens: Annotated[int, Meta(ge=1)] | None = None
     """Limit per run, all kinds of tokens together."""
     max_cost: Annotated[float, Meta(gt=0)] | None = None
-    """Limit per run, US dollars; needs `prices`, here or from `--set prices=FILE.toml`. None: 20 where there are
-    prices, and no limit with a published profile."""
+    """Limit per run, US dollars; needs `prices`. None: 20, and no limit without prices or with a published
+    profile."""
     prices: Prices | None = None
     prompts: Prompts | None = None
-    """Texts in place of the standard prompts; those of the run's own options win."""
+    """Texts in place of the standard prompts; the run's options win."""
     skills: tuple[str, ...] = ()
-    """Folders of skills, each with a file SKILL.md; below the folder in which the command is started."""
+    """Folders with a SKILL.md each, below the folder in which the command is started."""
     skills_at: str = ""
-    """Folder in which the agent looks for skills, as `~/.agents/skills`; empty: the one that is known for its
-    program."""
+    """Folder in which the agent looks for skills, as `~/.agents/skills`; empty: that of its program."""
     mcp: dict[str, McpServer] = {}
     """MCP servers by name."""
     cli: Cli | None = None
     api: ApiTable | None = None
-    """The model's API, for the built-in agent and for other agents that take its address and key from the usual
-    variables."""
+    """The model's API, for the built-in agent and agents that read its address and key from the usual variables."""
     acp: AcpTable | None = None
     """Of an agent that speaks the Agent Client Protocol."""
 

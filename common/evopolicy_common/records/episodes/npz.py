@@ -87,7 +87,7 @@ class _Member:
     def __init__(self, dtype: np.dtype[Any], shape: tuple[int, ...]) -> None:
         if dtype.hasobject:
             raise ProtocolError(
-                "observations that are neither numbers nor text cannot be stored beside the rows"
+                "observations that are neither numbers nor text cannot be stored apart from the rows"
             )
         self._dtype, self._shape = dtype, shape
         self._n = self._n_bytes = self._crc = 0

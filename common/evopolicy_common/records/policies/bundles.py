@@ -142,7 +142,7 @@ def walk(root: int, leave_out: Collection[str], most: int) -> Iterator[tuple[str
                     continue
                 inner = os.open(name, FOLDER, dir_fd=fd)
             except OSError as error:
-                yield path, f"cannot be read: {error.strerror}; was it changed meanwhile?"
+                yield path, f"cannot be read: {error.strerror}; was it changed during the snapshot?"
                 continue
             except BundleError as error:
                 yield ascii(path)[1:-1][:MAX_PATH_BYTES], f"has a name that cannot be taken: {error}"[:400]

@@ -26,7 +26,7 @@ from evopolicy_coordinator.core.tables.model import (
 from evopolicy_coordinator.core.tables.state import State
 
 NO_BOOT_ID = (
-    "the worker does not tell its kernel's boot id, so an agent may be on the same one; install the coordinator's"
+    "the worker does not report its kernel's boot id, so an agent may be on the same one; install the coordinator's"
     " version of evopolicy there"
 )
 

@@ -129,7 +129,7 @@ class StatusCollector(Collector):
         if status is None:
             return
         about = {"version": status.version, "cluster": status.cluster, "host": status.host}
-        yield InfoMetricFamily("evopolicy_build", "What serves.", about)
+        yield InfoMetricFamily("evopolicy_build", "Version, cluster, and host of the coordinator.", about)
         yield _gauge("evopolicy_uptime_seconds", "Since the coordinator started.", status.uptime_s)
         if status.store_latency_s is not None:
             text = "How long PostgreSQL took to confirm that this coordinator leads."

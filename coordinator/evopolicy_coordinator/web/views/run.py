@@ -165,9 +165,7 @@ def _one_run_notices(run: RunFacts, may_show: bool) -> list[dict[str, Any]]:
         notices.append(notice("Its hidden scores are shown once no agent of a related run is alive."))
     if run.path is None:
         where = f" on {run.host}" if run.host else ""
-        notices.append(
-            notice(f"Its folder is not on this host{where}: only what the cluster tells is shown.")
-        )
+        notices.append(notice(f"Its folder is not on this host{where}: only the cluster's data are shown."))
     return notices
 
 
