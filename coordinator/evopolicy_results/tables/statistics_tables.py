@@ -164,12 +164,12 @@ _PAIR = (
     Column("second", "Second"),
     Column("gap", "Difference", "number", of="gap.value", spread=lambda pair: pair.gap),
     Column("interval", INTERVAL, of=lambda pair: interval_text(pair.gap) or pair.reason or None),
+    Column("told_apart", "Significantly better", note=_BETTER, of=_told_apart),
     replace(OVER, of=_with_interval("over")),
     Column("method", "Method", of=_with_interval("method")),
     Column("p", "p", "number", digits=4, below=True),
     Column("p_exchange", "Exchange p", "number", digits=4, below=True),
     Column("p_holm", "Corrected p", "number", digits=4, below=True),
-    Column("told_apart", "Significantly better", note=_BETTER, of=_told_apart),
     Column("needed", "Needed", "integer", note=_NEEDED, of="n_needed"),
     Column("compares", "Compares", note="Checkpoints, where an entry has one run or policy; else agents."),
     Column(
