@@ -63,13 +63,16 @@ class Pair:
     """Two coordinators with one key for the secrets, the same blobs, and a certificate each, and machines that know
     both. The second one's folder begins empty."""
 
-    def __init__(self, root: Path, secret: Path, address: str) -> None:
+    def __init__(self, root: Path, address: str) -> None:
         self.root, self.address = root, address
         self.endpoints = tuple(f"tls/127.0.0.1:{free_port()}" for _ in range(2))
         self.members: list[Coordinator] = []
         self.key = root / "seal-key"
         self.key.touch(mode=0o600)
         self.key.write_bytes(Fernet.generate_key())
+
+    def start(self, secret: Path) -> None:
+        root = self.root
         for index in range(2):
             folder = root / f"state-{index}"
             folder.mkdir(mode=0o700)
@@ -124,8 +127,9 @@ class Pair:
 
 @contextlib.contextmanager
 def pair_of(root: Path, secret: Path, address: str) -> Iterator[Pair]:
-    pair = Pair(root, secret, address)
+    pair = Pair(root, address)
     try:
+        pair.start(secret)
         yield pair
     finally:
         pair.close()
