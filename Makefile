@@ -109,10 +109,10 @@ check: install
 	@$(BIN)/ruff format --check -q .
 	@$(BIN)/mypy
 
-# Resumed where it was stopped (build/check-envs.jsonl). A part, or longer episodes: make check-envs ARGS="--steps 1000 highway"
+# Resumed where it was stopped (build/check-envs.jsonl). A part: make check-envs ARGS=highway
 check-envs: install
 	@mkdir -p build
-	@$(BIN)/evopolicy-worker check-env --results build/check-envs.jsonl $(if $(ARGS),$(ARGS),--steps 600 "*"); status=$$?; \
+	@$(BIN)/evopolicy-worker check-env --results build/check-envs.jsonl $(if $(ARGS),$(ARGS),"*"); status=$$?; \
 	$(BIN)/python docs/_site/environments.py build/check-envs.jsonl && exit $$status
 
 docs: install

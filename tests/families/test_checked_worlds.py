@@ -18,5 +18,5 @@ def test_check_env_finds_nothing_in_the_worlds_of_core16(env: str, monkeypatch: 
     # A world costs as much as its environment, which is measured elsewhere.
     monkeypatch.setattr(check_env, "in_a_slot", lambda *given: check_env.InASlot())
     worlds = ids(env)
-    verdicts = {each.here.env: each.verdict for each in check_env.check(worlds, 40, ())}
+    verdicts = {each.here.env: each.verdict for each in check_env.check(worlds, (), 40)}
     assert verdicts == dict.fromkeys(worlds, "ok")

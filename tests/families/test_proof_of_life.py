@@ -76,5 +76,5 @@ def test_a_policy_beats_random_on_the_cases_that_were_fixed_beforehand(slots: Sl
 @pytest.mark.timeout(600)
 @each_family
 def test_check_env_finds_nothing_in_a_few_environments_of_the_family(proof: Proof) -> None:
-    verdicts = {each.here.env: each.verdict for each in check_env.check(proof.check, proof.check_steps, ())}
+    verdicts = {each.here.env: each.verdict for each in check_env.check(proof.check, (), proof.check_steps)}
     assert verdicts == dict.fromkeys(proof.check, "ok")

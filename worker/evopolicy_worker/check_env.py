@@ -34,6 +34,8 @@ from evopolicy_worker.slots.slot import Slot
 from evopolicy_worker.slots.tiers import available_tiers
 
 HASH_SEEDS = ("0", "1")
+STEPS = 600
+"""Greatest number of steps of an episode."""
 MOST_MEMORY_MB = 600
 """A slot whose processes need more is a fault: workers have a slot for each core."""
 _PLAYED = ("environment", "limit", "played", "ends", "same episode", "drawn")
@@ -102,7 +104,7 @@ class Checked(msgspec.Struct, frozen=True):
         return (*played, *self.slot.times(), f"{here.step_bytes:,}", memory, self.verdict)
 
 
-def check(env_ids: Sequence[str], steps: int, definitions: tuple[Entry, ...]) -> Iterator[Checked]:
+def check(env_ids: Sequence[str], definitions: tuple[Entry, ...], steps: int = STEPS) -> Iterator[Checked]:
     """Yields each environment when both processes and a slot have played it. Raises WorkerError when one of the
     processes ends too early."""
     variables = environments.process_environment(render=True)
@@ -242,7 +244,6 @@ async def _played(
 
 def command(
     env: Annotated[list[str], typer.Argument(help="Ids, suites, globs, or files of environments.")],
-    steps: Annotated[int, typer.Option(min=1, help="Greatest number of steps of an episode.")] = 600,
     results: Annotated[
         Path | None,
         typer.Option(
@@ -270,7 +271,7 @@ def command(
         here = divided.pop(sys.executable, [])
         environments.check_played(here)
         foreign = tuple(catalogue.entry(each) for each in here if not catalogue.is_shipped(each))
-        for done, checked in enumerate(check(here, steps, foreign), 1):
+        for done, checked in enumerate(check(here, foreign), 1):
             known[checked.here.env] = checked
             say(f"{done} of {len(here)}: {checked.here.env}: {checked.verdict}", err=True)
             if results is not None:
@@ -280,7 +281,7 @@ def command(
             with scratch_folder("check") as scratch:
                 kept = results or scratch / "results.jsonl"
                 program = [python, "-P", "-m", "evopolicy_worker.cli", "check-env", "--results", str(kept)]
-                program += ["--steps", str(steps), *elsewhere]
+                program += elsewhere
                 status = subprocess.run(program, stdout=subprocess.DEVNULL, check=False).returncode
                 known |= read(kept)
             if lost := [each for each in elsewhere if each not in known]:

@@ -39,9 +39,6 @@ def init(
             " Default: this machine's address and name."
         ),
     ] = None,
-    cluster: Annotated[
-        str | None, typer.Option(help="Name of the cluster, if the state folder is new [local].")
-    ] = None,
     renew: Annotated[
         bool,
         typer.Option("--renew", help="Renew the coordinator's certificate; those of machines stay valid."),
@@ -56,7 +53,7 @@ def init(
     The authority's key never leaves that folder: keep it, and its backups, as private as the hidden cases.
     """
     root = state or default_state_dir()
-    name = cluster_of(root, cluster)
+    name = cluster_of(root)
     old = machines.coordinators_certificate(root)
     if old is not None and not (renew or force):
         raise ConfigError(
@@ -106,7 +103,7 @@ def issue(
     root = state or default_state_dir()
     usual = first_endpoint(root)  # first: it makes no folder of a wrong --state
     cluster, folder, endpoints = (
-        cluster_of(root, None),
+        cluster_of(root),
         out or Path(f"{role}-{name}"),
         tuple(connect or (usual,)),
     )

@@ -92,7 +92,6 @@ def serve(
             help="Allow tcp/ to other machines: tokens and results can then be read on the network.",
         ),
     ] = False,
-    cluster: Annotated[str | None, typer.Option(help="Name of the cluster [local].")] = None,
     policy_package: Annotated[
         list[str] | None,
         typer.Option(help="Package that policies may import in addition to numpy; may be repeated."),
@@ -179,7 +178,6 @@ def serve(
         seal_key=seal_key,
         listen=tuple(listen or ()),
         insecure_tcp=insecure_tcp,
-        cluster=cluster,
         allowed_packages=checked_names(policy_package),
         unjailed=unjailed_agents,
         trust_workers=trust_workers,

@@ -99,7 +99,7 @@ def router_config(
     there = (installed_at or folder).absolute()
     files = {"root_ca": "ca.pem", "certificate": "cert.pem", "private_key": "key.pem"}
     settings = transport.site_router_settings(
-        cluster_of(root, None),
+        cluster_of(root),
         tuple(listen or (f"tls/0.0.0.0:{PORT}",)),
         there / "passwords",
         [(machine.role, machine.identity) for machine in admitted],

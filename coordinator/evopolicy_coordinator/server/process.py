@@ -68,7 +68,6 @@ class Options(msgspec.Struct, frozen=True, kw_only=True):
     """Endpoints besides the unix socket in the state folder; port 0 picks a free port."""
     insecure_tcp: bool = False
     """Whether to allow `tcp/` beyond this machine, where tokens and results can be read on the wire."""
-    cluster: str | None = None
     allowed_packages: tuple[str, ...] = ()
     """Packages that workers let policies import besides numpy; listed in `/info`."""
     unjailed: bool = False
@@ -130,7 +129,7 @@ async def _opened(
     known = False
     while not stop.is_set():
         try:
-            return StateFolder.open(options.state, options.cluster, options.local)
+            return StateFolder.open(options.state, options.local)
         except InUseError as error:
             ready = error.shared(options.local)
             if ready is not None and not known:

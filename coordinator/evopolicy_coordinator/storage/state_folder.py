@@ -37,7 +37,7 @@ from evopolicy_common.errors import DECODE_ERRORS, ConfigError
 from evopolicy_common.processes.preflight import check_writable, refused
 from evopolicy_common.records.blobs import write_atomically
 from evopolicy_common.records.open_run import is_held
-from evopolicy_common.wire import credentials, keys
+from evopolicy_common.wire import credentials
 from evopolicy_common.wire.credentials import WORKERS, Credentials, Ready, Role
 
 ROLES: tuple[Role, ...] = ("worker", "gateway", "operator")
@@ -117,16 +117,15 @@ class StateFolder:
         self._link: Path | None = None
 
     @classmethod
-    def open(cls, root: Path, cluster: str | None = None, local: dict[str, str] | None = None) -> StateFolder:
-        """Creates the folder if it is missing, locks it and reads its identity. `cluster` None: the folder's
-        own name, `local` for a new one. `local`: as in `Holder`. Raises InUseError when another coordinator holds the
-        lock, ConfigError when others may enter the folder, or it belongs to another cluster."""
+    def open(cls, root: Path, local: dict[str, str] | None = None) -> StateFolder:
+        """Creates the folder if it is missing, locks it and reads its identity. `local`: as in `Holder`. Raises
+        InUseError when another coordinator holds the lock, ConfigError when others may enter the folder."""
         root = Path(os.path.abspath(root))
-        _make_private(root, cluster)
+        _make_private(root)
         holder = Holder(process=os.getpid(), local=local)
         lock_fd = lock(root, holder)
         try:
-            return cls(root, lock_fd, holder, _identity(root, cluster))
+            return cls(root, lock_fd, holder, _identity(root))
         except BaseException:
             os.close(lock_fd)
             raise
@@ -194,16 +193,16 @@ class StateFolder:
         os.close(self._lock_fd)
 
 
-def cluster_of(root: Path, cluster: str | None) -> str:
-    """The name of a folder's cluster, `cluster` for a new one. Raises ConfigError as `StateFolder.open`."""
-    _make_private(root, cluster)
-    return _identity(root, cluster).cluster
+def cluster_of(root: Path) -> str:
+    """The name of a folder's cluster. Raises ConfigError as `StateFolder.open`."""
+    _make_private(root)
+    return _identity(root).cluster
 
 
 @contextlib.contextmanager
 def held(root: Path) -> Iterator[None]:
     """The folder, locked against others. Raises ConfigError as `StateFolder.open`."""
-    _make_private(root, None)
+    _make_private(root)
     lock_fd = lock(root)
     try:
         yield
@@ -211,9 +210,7 @@ def held(root: Path) -> Iterator[None]:
         os.close(lock_fd)
 
 
-def _make_private(root: Path, cluster: str | None) -> None:
-    if cluster is not None and not keys.valid_name(cluster):
-        raise ConfigError(f"--cluster {cluster!r}: use letters, digits, dots, dashes, at most 63")
+def _make_private(root: Path) -> None:
     # A coordinator that restarts on a full disk waits for space.
     check_writable(root, "--state", may_be_full=(root / "identity.json").exists())
     try:
@@ -253,23 +250,21 @@ def _write(fd: int, holder: Holder) -> None:
         os.pwrite(fd, msgspec.json.encode(holder) + b"\n", 0)
 
 
-def _identity(root: Path, cluster: str | None) -> Identity:
+def _identity(root: Path) -> Identity:
     path = root / "identity.json"
     try:
-        identity = msgspec.json.decode(path.read_bytes(), type=Identity)
+        return msgspec.json.decode(path.read_bytes(), type=Identity)
     except FileNotFoundError:
         identity = Identity(
-            cluster=cluster or "local",
+            cluster="local",
             passwords={role: secrets.token_urlsafe(24) for role in ROLES},
             worker_token=secrets.token_urlsafe(32),
             operator_token=secrets.token_urlsafe(32),
         )
         write_atomically(path, msgspec.json.encode(identity), mode=0o600)
+        return identity
     except DECODE_ERRORS as error:
         raise ConfigError(f"{path} is damaged: {error}; restore it from a backup") from error
-    if cluster is not None and identity.cluster != cluster:
-        raise ConfigError(f"state folder {root} is of cluster {identity.cluster!r}, not {cluster!r}")
-    return identity
 
 
 def _fits(folder: Path) -> bool:

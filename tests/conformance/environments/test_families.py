@@ -181,7 +181,7 @@ def test_check_env_names_what_is_not_kept_and_goes_on(
     ways = ("outside", "unseeded", "dies", "tells", "hash", "nothing")
     ids = [f"broken_environments:{how}-v0" for how in ways]
     results = tmp_path / "results.jsonl"
-    done = CliRunner().invoke(cli.app, ["check-env", "--steps", "10", "--results", str(results), *ids])
+    done = CliRunner().invoke(cli.app, ["check-env", "--results", str(results), *ids])
     assert done.exit_code == 1, done.output
     verdicts = {name.partition(":")[2]: each.verdict for name, each in check_env.read(results).items()}
     assert "outside its space" in verdicts["outside-v0"]

@@ -78,13 +78,12 @@ def test_everything_in_the_state_folder_is_private(coordinator: Coordinator) -> 
 def test_commands_of_the_same_user_find_the_cluster_by_its_endpoint(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    coordinator = Coordinator(tmp_path / "state", "--listen", "tcp/127.0.0.1:0", "--cluster", "lab")
+    coordinator = Coordinator(tmp_path / "state", "--listen", "tcp/127.0.0.1:0")
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "xdg"))
     try:
         endpoint = coordinator.ready["endpoints"][1]
         found = credentials.find("operator", (endpoint,))
         assert found == msgspec.structs.replace(coordinator.credentials("operator"), endpoints=(endpoint,))
-        assert found.cluster == "lab"
     finally:
         coordinator.kill()
 
@@ -116,7 +115,6 @@ async def test_signal_ends_it_in_good_order_also_while_others_wait_for_it(
     [
         (("--listen", "7447"), "tcp/HOST:PORT"),
         (("--data", "no/such/folder"), "--data no/such/folder is not a folder"),
-        (("--cluster", "a b"), "--cluster 'a b'"),
         (("--log-level", "loud"), "'--log-level': 'loud' is not one of"),
         (("--no-such-option",), "--no-such-option"),
     ],

@@ -93,8 +93,6 @@ def test_list_tells_names_roles_expiry_and_revocation_and_no_secret(
         (lambda state: certs_cli.revoke("nobody", state=state), "no machine 'nobody'"),
         (lambda state: certs_cli.list_(state=state / "new"), "certs init"),
         (lambda state: certs_cli.init(state=state, renew=True, host=["a b"]), "--host 'a b'"),
-        (lambda state: certs_cli.init(state=state, renew=True, cluster="other"), "is of cluster 'local'"),
-        (lambda state: certs_cli.init(state=state, renew=True, cluster="a b"), "--cluster 'a b'"),
     ],
 )
 def test_what_is_wrong_is_reported_and_changes_nothing(
@@ -104,9 +102,3 @@ def test_what_is_wrong_is_reported_and_changes_nothing(
     with pytest.raises(ConfigError, match=message):
         call(state)
     assert contents(state) == before
-
-
-def test_the_name_of_a_cluster_is_checked_before_anything_is_made(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="--cluster 'a b'"):
-        certs_cli.init(state=tmp_path / "state", cluster="a b")
-    assert not (tmp_path / "state").exists()

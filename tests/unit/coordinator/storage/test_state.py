@@ -40,10 +40,10 @@ def test_identity_survives_a_restart_and_nobody_else_reads_it(tmp_path: Path) ->
 
 
 def test_each_role_gets_its_own_password_and_only_its_own_token(tmp_path: Path) -> None:
-    state = StateFolder.open(tmp_path / "state", "lab")
+    state = StateFolder.open(tmp_path / "state")
     files = state.write_credentials(("tcp/10.0.0.5:7447",))
     found = {role: credentials.read(path) for role, path in files.items()}
-    assert {c.cluster for c in found.values()} == {"lab"}
+    assert {c.cluster for c in found.values()} == {"local"}
     assert len({c.password for c in found.values()}) == 3
     assert found["worker"].token == state.identity.worker_token
     assert found["operator"].token == state.identity.operator_token
@@ -122,15 +122,12 @@ def test_folder_that_others_may_enter_is_refused(tmp_path: Path) -> None:
         StateFolder.open(tmp_path)
 
 
-def test_folder_of_another_cluster_or_a_damaged_one_is_refused_and_unlocked(tmp_path: Path) -> None:
-    StateFolder.open(tmp_path, "lab").close()
-    with pytest.raises(ConfigError, match="is of cluster 'lab', not 'field'"):
-        StateFolder.open(tmp_path, "field")
+def test_damaged_folder_is_refused_and_unlocked(tmp_path: Path) -> None:
+    StateFolder.open(tmp_path).close()
     (tmp_path / "identity.json").write_text("{")
-    with pytest.raises(ConfigError, match="damaged"):
-        StateFolder.open(tmp_path, "lab")
-    with pytest.raises(ConfigError, match="--cluster 'a/b'"):
-        StateFolder.open(tmp_path, "a/b")
+    for _ in range(2):
+        with pytest.raises(ConfigError, match="damaged"):
+            StateFolder.open(tmp_path)
 
 
 def test_too_long_a_path_has_a_stable_short_link(tmp_path: Path, short_home: Path) -> None:
