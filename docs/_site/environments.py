@@ -7,10 +7,11 @@ so does the text above the table, which is written by hand. A family without a p
 from __future__ import annotations
 
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 from evopolicy_common import catalogue
-from evopolicy_worker.check_env import page
+from evopolicy_worker.check_env import COLUMNS, read
 
 FOLDER = Path(__file__).parents[1] / "reference" / "environments"
 MARK = "<!-- What follows is written by `make check-envs`. -->"
@@ -40,6 +41,24 @@ def written(suite: catalogue.Suite, results: Path | None, rows: str) -> str:
     text, mark, _ = (path.read_text("utf-8") if path.exists() else usual).partition(MARK)
     assert mark, f"{path} has no line {MARK!r}"
     return f"{text}{MARK}\n\n{page(results, rows, suite.environments)}"
+
+
+def page(results: Path | None, earlier: str = "", ids: Sequence[str] | None = None) -> str:
+    """A Markdown table of the results in a file, with the number of environments played. `earlier`: a text whose rows
+    stay where the file has none. `ids`: the environments, in order; by default the catalogue's."""
+    rows = table(earlier)
+    for env, each in (read(results) if results else {}).items():
+        rows[env] = each.cells()[1:]
+    ids = list(catalogue.entries()) if ids is None else ids
+    body = [f"| `{each}` | {' | '.join(rows[each])} |" for each in ids if each in rows]
+    head = [f"| {' | '.join(COLUMNS)} |", "|---|--:|--:|---|---|---|--:|--:|---|"]
+    return "\n".join([f"{len(body):,} of {len(ids):,} environments have been played.", "", *head, *body, ""])
+
+
+def table(text: str) -> dict[str, tuple[str, ...]]:
+    """The rows of pages without their ids, by environment id."""
+    rows = [line.strip("|").split("|") for line in text.splitlines() if line.startswith("| `")]
+    return {row[0].strip(" `"): tuple(map(str.strip, row[1:])) for row in rows if len(row) == len(COLUMNS)}
 
 
 def write(results: Path | None, rows: str) -> None:

@@ -1,11 +1,12 @@
 """Writes the table of families into README.md and docs/reference/environments.md: `python docs/_site/families.py`.
 
-Rows come from the catalogue, times from the table of played environments, and the original's coverage from
+Rows come from the catalogue, the number of played ones from their tables, and the original's coverage from
 original.toml.
 """
 
 from __future__ import annotations
 
+import re
 import textwrap
 import tomllib
 from functools import cache
@@ -14,15 +15,11 @@ from typing import Any
 
 from evopolicy_common import catalogue
 from evopolicy_common.catalogue import installs
-from evopolicy_worker.check_env import span, tables
 
 TOP = Path(__file__).parents[2]
 LIST = TOP / "docs" / "reference" / "environments.md"
 DOCUMENTS = (TOP / "README.md", LIST)
 END = "<!-- End of what it writes. -->"
-
-CPU = """*CPU ms*: processor time of a step of the library's environment alone, without accelerations ("bare"), and in a worker's slot
-with its policy and recording: median and range of the *measured* ids. `*`: one of them was measured on a busy machine."""  # noqa: E501
 
 
 def table() -> str:
@@ -30,8 +27,8 @@ def table() -> str:
     original, families = _original(), _families()
     named, newest = original["paper"]["families"], original["newest"]
     lines = [
-        ("| suite | environments | named in the paper | measured | CPU ms, bare | CPU ms, slot | extra |"),
-        "|---|--:|---|--:|--:|--:|---|",
+        "| suite | environments | named in the paper | extra |",
+        "|---|--:|---|---|",
     ]
     for suite in families:
         ids = suite.environments
@@ -42,7 +39,6 @@ def table() -> str:
             f"[`{suite.name}`](environments/{suite.name}.md)",
             f"{len(ids):,}",
             named.get(suite.name, "-"),
-            *_cost(suite),
             how + (" and Chromium" if row.browser else ""),
         )
         lines.append(f"| {' | '.join(cells)} |")
@@ -54,8 +50,7 @@ def table() -> str:
 The {len(families)} suites hold {_total(families):,} environments; the suite `paper13` holds the {len(named)} families that the paper
 names. The episodes of
 {_share(sum(map(_deterministic, families)), ids)} ids depend only on seed and actions, and `check-env` has played
-{_share(sum(each in _tables()[0] for suite in families for each in suite.environments), ids)}.
-{CPU}
+{_share(sum(each in played() for suite in families for each in suite.environments), ids)}.
 
 {textwrap.fill(f"evopolicy lacks of the original software's newest version: {lacking}.", 125)}"""  # noqa: E501
 
@@ -105,17 +100,11 @@ def _total(families: list[catalogue.Suite]) -> int:
     return len({each for suite in families for each in suite.environments})
 
 
-def _cost(suite: catalogue.Suite) -> tuple[str, str, str]:
-    """The number of ids that were measured, and the spans of the bare times and of the slot's, ms."""
-    known = [times for each in suite.environments if any(times := _tables()[1].get(each, ("", "")))]
-    spans = [span([each[column] for each in known], per=1000).split(", ") for column in (0, 1)]
-    bare, slot = (f"{one[1]} ({one[0]}–{one[2]})" if len(one) == 3 else one[0] for one in spans)
-    return f"{len(known):,}", bare, slot
-
-
 @cache
-def _tables() -> tuple[dict[str, tuple[str, ...]], dict[str, tuple[str, ...]]]:
-    return tables("\n".join(path.read_text("utf-8") for path in sorted(LIST.with_suffix("").glob("*.md"))))
+def played() -> frozenset[str]:
+    """The environments with a row on a page."""
+    pages = "\n".join(path.read_text("utf-8") for path in sorted(LIST.with_suffix("").glob("*.md")))
+    return frozenset(re.findall(r"^\| `(\S+)` \|", pages, re.MULTILINE))
 
 
 def written(document: str) -> str:

@@ -19,7 +19,7 @@ from bare_loop import seeds
 from evopolicy_common.messages.environment import Case
 from evopolicy_common.records.episodes.rendered import Renderer
 from evopolicy_worker import environments
-from evopolicy_worker.environments.checks.costs import literal
+from evopolicy_worker.check_env import literal
 
 
 def echo() -> Callable[[], None]:

@@ -1,4 +1,4 @@
-"""`evopolicy-worker check-env`: verdicts, the page, and environments that another installation plays."""
+"""`evopolicy-worker check-env`: verdicts, and environments that another installation plays."""
 
 from __future__ import annotations
 
@@ -10,33 +10,17 @@ from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 
-import msgspec
 import pytest
 
-from evopolicy_common import catalogue
-from evopolicy_common.catalogue import Entry
-from evopolicy_worker.check_env import COLUMNS, MOST_MEMORY_MB, TIMES, Checked, InASlot, bare_loop, page
+from evopolicy_worker.check_env import MOST_MEMORY_MB, Checked, InASlot
 from evopolicy_worker.environments.checks import conformance
 from evopolicy_worker.environments.checks.conformance import CheckResult
 
 CARTPOLE, PENDULUM = "gymnasium/CartPole-v1", "gymnasium/Pendulum-v1"
 
-ENDS_ITS_PROCESS = """
-import os
-import gymnasium
 
-class Ends(gymnasium.Env):
-    observation_space = action_space = gymnasium.spaces.Box(-1, 1, (1,))
-
-    def reset(self, *, seed=None, options=None):
-        os._exit(1)
-
-gymnasium.register("Ends-v0", Ends)
-"""
-
-
-def checked(env: str, *, memory_mb: int = 100, steps: int = 7, fault: str = "") -> Checked:
-    played = CheckResult(env=env, digest="d", fresh=True, reused=True, steps=steps)
+def checked(env: str, *, memory_mb: int = 100, fault: str = "") -> Checked:
+    played = CheckResult(env=env, digest="d", fresh=True, reused=True)
     return Checked(played, played, InASlot(memory_mb=memory_mb, fault=fault))
 
 
@@ -45,47 +29,6 @@ def test_a_slot_that_needs_too_much_memory_is_a_fault() -> None:
     assert checked(CARTPOLE, memory_mb=601).verdict == "its slot needs 601 MB; 600 are the limit"
     both = checked(CARTPOLE, memory_mb=601, fault="in a slot: no")
     assert both.verdict == "in a slot: no; its slot needs 601 MB; 600 are the limit"
-
-
-def test_a_page_keeps_the_rows_of_environments_that_were_not_played_again(tmp_path: Path) -> None:
-    results = tmp_path / "results.jsonl"
-    results.write_bytes(b"".join(msgspec.json.encode(checked(env)) + b"\n" for env in (CARTPOLE, PENDULUM)))
-    first = page(results)
-    assert first.startswith(f"2 of {len(catalogue.entries()):,} environments")
-    results.write_bytes(msgspec.json.encode(checked(PENDULUM, steps=600)) + b"\n")
-    second = page(results, f"text | of | the page\n{first}")
-    (head,) = (line for line in second.splitlines() if line.startswith("| environment"))
-    assert head == f"| {' | '.join(each for each in COLUMNS if each not in COLUMNS[TIMES])} |"
-    rows = {
-        line.split("`")[1]: line.split("|")[3].strip()
-        for line in second.splitlines()
-        if line.startswith("| `")
-    }
-    assert rows == {CARTPOLE: "7", PENDULUM: "600"}
-
-
-def test_the_bare_loop_plays_the_same_stretch_at_each_turn() -> None:
-    with bare_loop(()) as bare:
-        first, again, other = bare(CARTPOLE), bare(CARTPOLE), bare("toy/line")
-    assert first.actions == again.actions
-    assert set(first.actions) == {0, 1}
-    assert first.cpu_s > 0
-    assert other.fault == "TypeError: it is not a Gymnasium environment, and has no bare loop"
-
-
-def test_a_lost_bare_loop_costs_later_environments_their_times_alone(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    (tmp_path / "ends_it.py").write_text(ENDS_ITS_PROCESS)
-    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
-    ends = Entry(id="acme/ends", gymnasium_id="ends_it:Ends-v0", family="acme")
-    with bare_loop((ends,)) as bare:
-        assert [bare(env).fault for env in ("acme/ends", CARTPOLE, PENDULUM)] == ["its process ended"] * 3
-
-
-def test_a_time_says_whether_the_machine_was_busy() -> None:
-    assert InASlot(bare_us=12.345, slot_us=1234.5, busy=True).times() == ("12.3*", "1,234*")
-    assert InASlot(bare_us=12.345).times() == ("12.3", "")
 
 
 MARK = f"of test_check_env {secrets.token_hex()}".encode()
