@@ -1,8 +1,6 @@
 """An agent's log as steps: prompts, messages with tool calls and their results, notes of ours.
 
-`logs/agent.jsonl` holds a harness's raw stream. The known forms are those of `stream-json` (Claude Code, the built-in
-LLM agent, agents of the Agent Client Protocol), Codex's `exec --json`, the turn protocol, and plain lines. Other lines
-are skipped. An agent may write anything there, so reading takes linear time and bounded memory, and raises for nothing.
+An agent may write anything into its log, so reading takes linear time and bounded memory, and raises for nothing.
 """
 
 from __future__ import annotations
@@ -15,6 +13,7 @@ from typing import Any, Literal
 import msgspec
 
 from evopolicy_common.errors import DECODE_ERRORS
+from evopolicy_common.records.agent_log import Part, parts
 from evopolicy_common.regular_files import open_regular
 
 MAX_LOG_BYTES = 64 << 20
@@ -106,78 +105,43 @@ class _Log:
             return
         if not isinstance(event, dict) or _is_deeper(event, _MAX_LEVELS):
             return
-        kind, at = event.get("type"), _time(event.get("timestamp"))
-        message, text = event.get("message"), event.get("text")
-        if kind == "prompt":
-            self.step("user", at=at).texts.append(_text(message))
-        elif kind in ("assistant", "user") and isinstance(message, dict):
-            self._message(message, at, by_agent=kind == "assistant")
-        elif kind == "item.completed" and isinstance(event.get("item"), dict):
-            self._item(event["item"], at)
-        elif kind in ("stdout", "stderr") and isinstance(text, str):
-            self.step("agent" if kind == "stdout" else "system", kind, at).texts.append(text)
-        elif kind in _NOTES:
-            fields = {name: value for name, value in event.items() if name not in ("type", "timestamp")}
-            self.step("system", at=at).texts.append(f"{kind}: {_json(fields)}")
-        elif isinstance(event.get("turn"), int) and isinstance(text, str):
-            self.step("agent", at=at).texts.append(text)
-
-    def _message(self, message: dict[str, Any], at: str | None, *, by_agent: bool) -> None:
-        """A message of `stream-json`. Claude Code repeats a message's id with each of its blocks."""
-        identity = message.get("id")
-        key = f"message {identity}" if by_agent and isinstance(identity, str) and identity else ""
-        content = message.get("content")
-        blocks = content if isinstance(content, list) else [{"type": "text", "text": content}]
+        at = _time(event.get("timestamp"))
         step: LogStep | None = None
-        for block in blocks:
-            if not isinstance(block, dict):
-                continue
-            kind = block.get("type")
-            if kind == "tool_result":
-                self.result(block.get("tool_use_id"), block.get("content"), block.get("is_error") is True)
-            elif by_agent and kind in ("text", "thinking", "tool_use"):
-                step = step or self.step("agent", key, at)
-                if kind == "tool_use":
-                    self.call(step, block.get("id"), block.get("name"), block.get("input"))
-                elif text := _text(block.get("text" if kind == "text" else "thinking")).strip():
-                    (step.texts if kind == "text" else step.reasoning).append(text)
+        for part in parts(event):
+            match part.kind:
+                case "prompt":
+                    self.step("user", at=at).texts.append(_text(part.value))
+                case "stdout" | "stderr":
+                    self.step("agent" if part.kind == "stdout" else "system", part.kind, at).texts.append(
+                        part.value
+                    )
+                case "note" if part.name in _NOTES:
+                    self.step("system", at=at).texts.append(f"{part.name}: {_json(part.value)}")
+                case "result":
+                    self.result(part)
+                case "call" | "text" | "thinking" if part.by_agent:
+                    step = step or self.step("agent", part.message, at)
+                    if part.kind == "call":
+                        self.call(step, part)
+                    elif text := _text(part.value).strip():
+                        (step.texts if part.kind == "text" else step.reasoning).append(text)
 
-    def _item(self, item: dict[str, Any], at: str | None) -> None:
-        """A completed item of Codex: a message, reasoning, or a call together with its result."""
-        kind = item.get("type") or item.get("item_type")
-        identity = item.get("id")
-        failed = item.get("status") == "failed" or item.get("exit_code") not in (0, None)
-        step = self.step("agent", at=at)
-        if kind in ("agent_message", "assistant_message", "reasoning"):
-            (step.reasoning if kind == "reasoning" else step.texts).append(_text(item.get("text")))
-        elif kind == "command_execution":
-            self.call(step, identity, "shell", {"command": item.get("command")})
-            self.result(identity, item.get("aggregated_output"), failed)
-        elif kind == "mcp_tool_call":
-            name = f"{_text(item.get('server'))}.{_text(item.get('tool'))}"
-            self.call(step, identity, name, item.get("arguments"))
-            self.result(identity, item.get("error") or item.get("result"), failed)
-        else:
-            given = {name: value for name, value in item.items() if name not in ("id", "type", "item_type")}
-            self.call(step, identity, kind, given)
-
-    def call(self, step: LogStep, identity: Any, name: Any, arguments: Any) -> None:
+    def call(self, step: LogStep, part: Part) -> None:
         self._n_calls += 1
-        known = identity if isinstance(identity, str) and identity else ""
-        unique = known
+        unique = part.id
         while not unique or unique in self._calls:
-            unique = f"{known or 'call'}-{self._n_calls}"
+            unique = f"{part.id or 'call'}-{self._n_calls}"
             self._n_calls += unique in self._calls
+        arguments = {"command": part.value} if part.name == "shell" else part.value
         if not isinstance(arguments, dict):
             arguments = {} if arguments is None else {"input": arguments}
-        call = Call(id=unique, name=_text(name) or "tool", arguments=arguments)
+        call = Call(id=unique, name=part.name or "tool", arguments=arguments)
         step.calls.append(call)
-        self._calls[known] = self._calls[unique] = step, call
+        self._calls[part.id] = self._calls[unique] = step, call
 
-    def result(self, identity: Any, content: Any, failed: bool) -> None:
-        known = self._calls.get(identity if isinstance(identity, str) else "")
-        step, call = known or (self.step("system"), None)
-        step.results.append(Result(call=call, text=_text(content), failed=failed))
+    def result(self, part: Part) -> None:
+        step, call = self._calls.get(part.id) or (self.step("system"), None)
+        step.results.append(Result(call=call, text=_text(part.value), failed=part.failed))
 
 
 def _text(value: Any, depth: int = 0) -> str:

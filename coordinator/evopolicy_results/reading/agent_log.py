@@ -1,10 +1,5 @@
 """Reads from an agent's own log what preceded each submit: its messages, the feedback it read, the images it made.
 
-`logs/agent.jsonl` holds a harness's raw stream, one JSON value per line. Three forms are known: Claude Code's
-`stream-json` (assistant and user messages with content blocks), Codex's `exec --json` (`item.completed`), and the
-output of command agents: the turn protocol (`{"turn", "text", "stop"}`) and plain lines (`{"type": "stdout",
-"text"}`). Lines in any other form, and invalid JSON, are skipped.
-
 A submit's position in the stream is the first tool output with its answer (`submit_id`, or its summary), or the first
 plain line that begins with its name. If the log never shows answers but has timestamps, these decide. If it has
 neither, nothing is attributed: messages are listed separately rather than guessed into place.
@@ -25,7 +20,7 @@ from typing import Any
 
 import msgspec
 
-from evopolicy_common.errors import DECODE_ERRORS
+from evopolicy_common.records.agent_log import parts
 from evopolicy_common.records.json_lines import objects
 from evopolicy_common.regular_files import open_regular
 from evopolicy_results.reading.records import Submit
@@ -44,7 +39,6 @@ _PATH = re.compile(r"[\w./-]+")
 _IMAGE_SUFFIX = re.compile(r"(?<=.)\.(?:png|jpe?g|gif|webp)\b", re.IGNORECASE)
 _ANSWER = re.compile(r"submit_(?:id|index)[\\\"'\s:=]+(?:submit_)?0*(\d+)")
 _NAMED = re.compile(r"submit_0*(\d{1,9})\b")
-_WRAPPERS = ("event", "line", "payload", "data", "raw")
 _TIMES = ("timestamp", "at", "time", "ts")
 _MAX_STAMP_CHARS = 64
 
@@ -150,43 +144,14 @@ def _lines(path: Path) -> Iterator[bytes]:
 
 def _events_of(value: dict[str, Any]) -> Iterator[LogEvent]:
     at = _stamp(value)
-    if not {"type", "turn", "message"} & value.keys():
-        inner = next((value[key] for key in _WRAPPERS if key in value), None)
-        if isinstance(inner, str):
-            try:
-                inner = msgspec.json.decode(inner)
-            except DECODE_ERRORS:
-                return
-        if not isinstance(inner, dict):
-            return
-        value, at = inner, _stamp(inner) if at is None else at
-    match value:
-        case {"type": "assistant" | "user" as role}:
-            message = value.get("message")
-            content = message.get("content") if isinstance(message, dict) else None
-            blocks = [{"type": "text", "text": content}] if isinstance(content, str) else content
-            for block in blocks if isinstance(blocks, list) else ():
-                match block:
-                    case {"type": "text", "text": str(text)} if role == "assistant" and text.strip():
-                        yield LogEvent(message=_clip(text), at=at)
-                    case {"type": "tool_use"}:
-                        yield _call(block.get("input"), at)
-                    case {"type": "tool_result"}:
-                        yield LogEvent(answered=_answered_submits(block.get("content")), at=at)
-        case {"type": "item.completed", "item": {**item}}:
-            match item.get("type") or item.get("item_type"), item:
-                case "agent_message" | "assistant_message", {"text": str(text)}:
-                    yield LogEvent(message=_clip(text), at=at)
-                case "command_execution", _:
-                    yield _call(item.get("command"), at)
-                    yield LogEvent(answered=_answered_submits(item.get("aggregated_output")), at=at)
-                case "mcp_tool_call" | "file_change", _:
-                    yield _call(item.get("arguments") or item.get("changes"), at)
-        case {"type": "stdout", "text": str(text)}:
-            named = _NAMED.match(text)
-            yield LogEvent(message=_clip(text), answered=(int(named[1]),) if named else (), at=at)
-        case {"turn": int(), "text": str(text)}:
-            yield LogEvent(message=_clip(text), at=at)
+    for part in parts(value):
+        if part.kind == "call":
+            yield _call(part.value, at)
+        elif part.kind == "result":
+            yield LogEvent(answered=_answered_submits(part.value), at=at)
+        elif part.kind in ("text", "stdout") and part.by_agent and isinstance(part.value, str):
+            named = _NAMED.match(part.value) if part.kind == "stdout" else None
+            yield LogEvent(message=_clip(part.value), answered=(int(named[1]),) if named else (), at=at)
 
 
 def _call(arguments: Any, at: float | None) -> LogEvent:

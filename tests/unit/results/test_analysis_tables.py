@@ -182,7 +182,7 @@ def test_damaged_or_strange_log_lines_are_passed_over(tmp_path: Path) -> None:
         b'"text"',
         b'{"type": "assistant", "message": {"content": "\xd6 "}}',
     ]
-    strange.append(b'{"raw": "{\\"turn\\": 1, \\"text\\": \\"hello\\"}"}')
+    strange.append(b'{"turn": 1, "text": "hello"}')
     strange.append(b'{"type": "item.completed", "item": {"type": "command_execution", "command": null}}')
     log.write_bytes(b"\n".join(strange))
     assert read_agent_log(log, run.submits).unplaced == ("hello",)

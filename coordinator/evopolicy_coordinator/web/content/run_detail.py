@@ -10,7 +10,7 @@ import contextlib
 import itertools
 import os
 from collections import OrderedDict
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from string import Formatter
 from typing import Any
@@ -22,6 +22,7 @@ from evopolicy_common.confined import Confined, NotThereError
 from evopolicy_common.errors import DECODE_ERRORS, BundleError
 from evopolicy_common.messages.bounds import LARGEST
 from evopolicy_common.records import open_run
+from evopolicy_common.records.agent_log import Part, parts
 from evopolicy_common.records.blobs import is_digest
 from evopolicy_common.records.episodes.npz import read_arrays
 from evopolicy_common.records.json_lines import objects
@@ -289,59 +290,38 @@ def _series(columns: Any, n: int, name: str) -> tuple[list[Line], str]:
 # ---- the agent's log ----
 
 
-_FORMS: Mapping[str, Sequence[tuple[str, str, str]]] = {
-    "prompt": [("prompt", "Prompt", "message")],
-    "stdout": [("output", "", "text")],
-    "stderr": [("stderr", "", "text")],
-    "turn": [("message", "", "text")],
-    "result": [("ended", "Turn ended", "subtype")],
-    "log_full": [("ended", "log_full", "text message")],
-    "error": [("ended", "error", "text message")],
-    "block text": [("message", "", "text")],
-    "block thinking": [("message", "Thinking", "thinking")],
-    "block tool_use": [("tool", "{name}", "input")],
-    "block tool_result": [("result", "Result", "content")],
-    "item agent_message": [("message", "", "text")],
-    "item assistant_message": [("message", "", "text")],
-    "item reasoning": [("message", "Thinking", "text")],
-    "item command_execution": [("tool", "shell", "command"), ("result", "Result", "aggregated_output")],
-    "item mcp_tool_call": [("tool", "mcp_tool_call", "arguments changes")],
-    "item file_change": [("tool", "file_change", "arguments changes")],
+_SHOWN: Mapping[str, tuple[str, str]] = {
+    "prompt": ("prompt", "Prompt"),
+    "text": ("message", ""),
+    "thinking": ("message", "Thinking"),
+    "result": ("result", "Result"),
+    "stdout": ("output", ""),
+    "stderr": ("stderr", ""),
 }
-"""By the type of a line, of a block of a message, or of a Codex item: kind and title of its entries, and the
-fields of which the first that is not empty is the text."""
+"""Kind and title of an entry, by the kind of its part."""
+_ENDS: Mapping[str, tuple[str, tuple[str, ...]]] = {
+    "result": ("Turn ended", ("subtype",)),
+    "log_full": ("log_full", ("text", "message")),
+    "error": ("error", ("text", "message")),
+}
+"""Title of an entry, and the fields of which the first that is not empty is its text, by the type of a note."""
 
 
 def _messages(at: int, line: bytes) -> Iterator[Message]:
-    told = (
-        entry for value in objects([line]) for form, inner in _parts(value) for entry in _told(form, inner)
-    )
+    told = (entry for value in objects([line]) for part in parts(value) for entry in _told(part))
     for number, (kind, title, text) in enumerate(told):
         if text.strip() or title:
             yield Message(at=at + number, kind=kind, title=title[:200], text=_cut(text.strip()))
 
 
-def _parts(value: dict[str, Any]) -> Iterator[tuple[str, dict[str, Any]]]:
-    """The parts of a line with text, in the forms that harnesses write, each with its form."""
-    kind = value.get("type")
-    if kind in ("assistant", "user") and isinstance(value.get("message"), dict):
-        content = value["message"].get("content")
-        blocks = [{"type": "text", "text": content}] if isinstance(content, str) else content
-        for block in blocks if isinstance(blocks, list) else ():
-            if isinstance(block, dict):
-                yield f"block {block.get('type')}", block
-    elif kind == "item.completed" and isinstance(item := value.get("item"), dict):
-        yield f"item {item.get('type') or item.get('item_type')}", item
-    elif isinstance(value.get("turn"), int) and "text" in value:
-        yield "turn", value
-    else:
-        yield str(kind), value
-
-
-def _told(form: str, value: dict[str, Any]) -> Iterator[tuple[str, str, str]]:
-    for kind, title, fields in _FORMS.get(form, ()):
-        text = next((value[name] for name in fields.split() if value.get(name)), "")
-        yield kind, title.format(name=value.get("name", "tool")), _plain(text)
+def _told(part: Part) -> Iterator[tuple[str, str, str]]:
+    if part.kind == "call":
+        yield "tool", part.name or "tool", _plain(part.value)
+    elif part.kind != "note":
+        yield *_SHOWN[part.kind], _plain(part.value)
+    elif part.name in _ENDS:
+        title, fields = _ENDS[part.name]
+        yield "ended", title, _plain(next((part.value[name] for name in fields if part.value.get(name)), ""))
 
 
 def _plain(value: Any) -> str:
