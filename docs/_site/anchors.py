@@ -24,15 +24,14 @@ import proofs  # noqa: E402
 from measure_policies import POLICIES, play, play_all  # noqa: E402
 
 from evopolicy_common import catalogue  # noqa: E402
-from evopolicy_common.catalogue import anchors, installs  # noqa: E402
-from evopolicy_common.catalogue.anchors import Anchor, Measured  # noqa: E402
+from evopolicy_common.catalogue import Anchor, Measured, installs  # noqa: E402
 from evopolicy_common.statistics.intervals import over_cases  # noqa: E402
 from evopolicy_worker.environments.interface.base import Environment  # noqa: E402
 from evopolicy_worker.environments.registry import make  # noqa: E402
 
-FILE = TOP / "common" / "evopolicy_common" / "catalogue" / "anchors.json"
+FILE = TOP / "common" / "evopolicy_common" / "catalogue" / "catalogue.json"
 PAGE = TOP / "docs" / "reference" / "environments.md"
-MARKS = ("<!-- Written by docs/_site/anchors.py. -->", "<!-- End of what anchors.py writes. -->")
+MARKS = ("<!-- Written by docs/_site/anchors.py. -->", "<!-- End of what catalogue.py writes. -->")
 N_CASES = 32
 
 
@@ -100,7 +99,7 @@ def table() -> str:
         return f"{one.mean:.{digits}f} ± {half:.{digits}f}"
 
     lines = ["| environment | random (95 % interval) | best known (95 % interval) |", "|---|---|---|"]
-    for env_id, each in anchors.anchors().items():
+    for env_id, each in catalogue.anchors().items():
         link = f"[{cell(each.best)}](../../{each.policy}/policy.py)"
         lines.append(f"| {env_id} | {cell(each.random)} | {link} |")
     return "\n".join(lines)
@@ -120,9 +119,9 @@ def main(ids: list[str]) -> None:
         print(env_id, anchor.random.mean, anchor.best.mean, flush=True)
     for python, elsewhere in divided.items():
         subprocess.run([python, __file__, *elsewhere], check=True)
-    anchors.anchors.cache_clear()
+    catalogue.anchors.cache_clear()
     PAGE.write_text(written(PAGE.read_text("utf-8")), encoding="utf-8")
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:] or [each for each in policies() if each not in anchors.anchors()])
+    main(sys.argv[1:] or [each for each in policies() if each not in catalogue.anchors()])

@@ -36,8 +36,8 @@ AGENT = '[[agents]]\nname = "{}"\nagent = "random"\n'
 APART = """
 import sys
 if "evopolicy_worker.cli" in sys.orig_argv:
-    from evopolicy_common.processes import host
-    host.boot_id = lambda: "another-kernel"
+    from evopolicy_common.processes import proc
+    proc.boot_id = lambda: "another-kernel"
 """
 RULES = {"off": "shared", "related": "exclusive", "apart": "exclusive"}
 """Each sweep, and the stamp of its runs."""

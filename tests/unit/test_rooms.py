@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from evopolicy_common.simulators import SIMULATORS
+from evopolicy_common.processes.packages import SIMULATORS
 
 ROOT = Path(__file__).parents[2]
 ROOMS = {

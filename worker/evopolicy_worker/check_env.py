@@ -29,8 +29,7 @@ from evopolicy_common.terminal import say
 from evopolicy_worker import environments
 from evopolicy_worker.environments.checks.conformance import SEEDS, CheckResult
 from evopolicy_worker.environments.interface.actions import compile_actions
-from evopolicy_worker.slots.slot import Slot
-from evopolicy_worker.slots.tiers import available_tiers
+from evopolicy_worker.slots.slot import Slot, available_tiers
 
 HASH_SEEDS = ("0", "1")
 STEPS = 600

@@ -28,7 +28,7 @@ from evopolicy_common.errors import ConfigError, MachineError, SandboxError
 from evopolicy_common.logs import structlog
 from evopolicy_common.messages.environment import EnvironmentDescription
 from evopolicy_common.messages.episode import Tier
-from evopolicy_common.processes import distribution, host
+from evopolicy_common.processes import distribution, proc
 from evopolicy_common.processes.notices import notify_of_many_slots
 from evopolicy_common.processes.packages import checked_names, policy_versions
 from evopolicy_common.processes.preflight import check_scratch
@@ -41,8 +41,7 @@ from evopolicy_worker.capabilities import Capabilities, describe_all, log_missin
 from evopolicy_worker.doctor import best_tier, examine
 from evopolicy_worker.environments.interface.calls import USUAL, Limits
 from evopolicy_worker.environments.interface.fingerprint import fingerprint
-from evopolicy_worker.slots.slot import Slot
-from evopolicy_worker.slots.tiers import SANDBOXED, available_tiers, try_out, why_not
+from evopolicy_worker.slots.slot import SANDBOXED, Slot, available_tiers, try_out, why_not
 from evopolicy_worker.supervisor import MAX_PREPARED, Options, Supervisor
 
 app = App()
@@ -324,12 +323,12 @@ async def _run(
             slots=len(taken),
             fingerprint=msgspec.structs.replace(own, packages=own.packages | importable),
             host=socket.gethostname(),
-            boot_id=host.boot_id(),
+            boot_id=proc.boot_id(),
             scratch=scratch,
             grace_s=grace_s,
         )
         if not options.boot_id:
-            log.warning("this worker gets no hidden episodes", why=host.NO_BOOT_ID)
+            log.warning("this worker gets no hidden episodes", why=proc.NO_BOOT_ID)
         log.info("waiting for the coordinator", endpoints=joining.endpoints)
         connecting = transport.connect(joining, timeout_s=None, read_again=None if ready_file else find)
         with contextlib.suppress(asyncio.CancelledError):

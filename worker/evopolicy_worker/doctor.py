@@ -26,7 +26,7 @@ from evopolicy_common.console import filled_table, terminal
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.installation import add_extra
 from evopolicy_common.messages.episode import Tier
-from evopolicy_common.processes import distribution, host
+from evopolicy_common.processes import distribution, proc
 from evopolicy_common.processes.preflight import EXTRAS, check_loopback, check_scratch
 from evopolicy_common.terminal import say, say_json
 from evopolicy_common.wire.credentials import local_state_dir
@@ -37,7 +37,7 @@ from evopolicy_worker.environments.interface.fingerprint import fingerprint
 from evopolicy_worker.environments.interface.gymnasium_adapter import quiet
 from evopolicy_worker.sandbox import jail, seccomp
 from evopolicy_worker.sandbox.inside.zygote import CLONE_NEWIPC, CLONE_NEWNS, CLONE_NEWPID, CLONE_NEWUSER
-from evopolicy_worker.slots.tiers import SANDBOXED, why_not
+from evopolicy_worker.slots.slot import SANDBOXED, why_not
 
 app = App(name="doctor")
 
@@ -102,9 +102,9 @@ def examine() -> Iterator[Check]:
     """All checks, in display order. The last ones start each sandbox tier, in about a second."""
     own, machine, landlock = fingerprint(), platform.machine(), jail.landlock_version()
     yield Check("kernel", "note", f"{platform.system()} {platform.release()} {machine}")
-    boot_id = host.boot_id()
+    boot_id = proc.boot_id()
     unknown = "unknown, so this worker gets no hidden episodes"
-    yield row("boot id", boot_id, boot_id, unknown, host.NO_BOOT_ID)
+    yield row("boot id", boot_id, boot_id, unknown, proc.NO_BOOT_ID)
     version, why = _bubblewrap()
     yield row("bubblewrap", not why, version, why, distribution.install("bubblewrap"), _WITHOUT_NAMESPACES)
     for name, flag in _NAMESPACES.items():

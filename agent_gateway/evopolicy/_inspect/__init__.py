@@ -37,7 +37,7 @@ from evopolicy._loop import awaited
 from evopolicy._runs import Run
 from evopolicy_common import catalogue
 from evopolicy_common.errors import ConfigError, EvopolicyError
-from evopolicy_common.processes import host
+from evopolicy_common.processes import proc
 from evopolicy_common.records.words import in_words
 from evopolicy_gateway.agents.client import Client, ProtocolError, Refusal
 from evopolicy_gateway.harnesses.coding_agents import session
@@ -192,7 +192,7 @@ def open_run(where: Where, options: dict[str, Any], exp_id: str, entry: str | No
             state.metadata["env"],
             listener.AGENT,
             listener=Listener(host="127.0.0.1", port=0),
-            agent_host=host.boot_id(),
+            agent_host=proc.boot_id(),
             exp_id=f"{exp_id}-{state.epoch}" + (f".{attempt}" if attempt else ""),
             entry=entry or f"{get_model()} (Inspect)",
             model=str(get_model()),

@@ -29,8 +29,7 @@ from evopolicy_gateway.inputs import own_config
 from evopolicy_gateway.jail.jail import Jail
 from evopolicy_gateway.processes import child_messages as messages
 from evopolicy_gateway.processes import trees as processes
-from evopolicy_gateway.processes.agent_log import AgentLog
-from evopolicy_gateway.processes.agent_process import environment_of
+from evopolicy_gateway.processes.agent_process import AgentLog, environment_of
 from evopolicy_gateway.processes.child_messages import AgentEnded, Orders, StartAgent, emit
 from evopolicy_gateway.processes.clock import Activity, AgentClock
 from evopolicy_gateway.processes.resources import Resources

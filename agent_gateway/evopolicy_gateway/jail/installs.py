@@ -15,8 +15,7 @@ import sysconfig
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from evopolicy_common.processes.packages import files_of
-from evopolicy_common.simulators import SIMULATORS
+from evopolicy_common.processes.packages import SIMULATORS, files_of
 
 SYSTEM = ("/usr", "/bin", "/sbin", "/lib", "/lib32", "/lib64", "/libx32")
 """Folders visible in every jail."""

@@ -22,17 +22,21 @@ import stat
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.seccomp import (
     ALLOWED,
+    ATTRIBUTES,
     AUDIT_ARCH,
     JUMP_ANY_BIT,
     JUMP_EQUAL,
     LOAD,
+    MODES,
+    REFUSED,
+    SET_AFFINITY,
+    SOCKET,
     Instruction,
     argument,
     one_of,
     program,
     refuse,
 )
-from evopolicy_common.seccomp.numbers import ATTRIBUTES, MODES, REFUSED, SET_AFFINITY, SOCKET
 
 GIVE_UP = (
     "or give the jail up by name with --jail none of `evopolicy run` or `local`, which run.json then says"

@@ -24,11 +24,10 @@ from evopolicy_common.records.secrets import Redaction
 from evopolicy_gateway.relay import apis, limits, requests
 from evopolicy_gateway.relay.answers import FREE, SHAPES, AnswerReader
 from evopolicy_gateway.relay.apis import Refusal, Route, Upstream
-from evopolicy_gateway.relay.ledger import Ledger
+from evopolicy_gateway.relay.limits import Ledger
 from evopolicy_gateway.relay.provider import FAILED, NOT_SENT, Answer, Provider, Sent
 from evopolicy_gateway.relay.recording import MAX_ANSWER_BYTES as MAX_RECORDED_BYTES
-from evopolicy_gateway.relay.recording import Cleaning, Recorder, Source
-from evopolicy_gateway.relay.replaying import Replayed
+from evopolicy_gateway.relay.recording import Cleaning, Recorder, Replayed, Source
 from evopolicy_gateway.relay.requests import Facts
 from evopolicy_gateway.relay.usage import Usage
 

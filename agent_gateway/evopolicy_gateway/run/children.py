@@ -12,7 +12,7 @@ from pathlib import Path
 import msgspec
 
 from evopolicy_common.errors import EvopolicyError
-from evopolicy_common.processes import child_process, host
+from evopolicy_common.processes import child_process, proc
 from evopolicy_common.records.blobs import write_atomically
 from evopolicy_common.records.run_record import AgentLimits
 from evopolicy_common.wire import credentials
@@ -20,7 +20,7 @@ from evopolicy_common.wire.credentials import Credentials
 from evopolicy_gateway.jail.jail import JailOrder
 from evopolicy_gateway.processes import child_messages as messages
 from evopolicy_gateway.processes.child_messages import AgentEnded, Child, Progress, Ready, RelayAddress
-from evopolicy_gateway.relay import ledger
+from evopolicy_gateway.relay.limits import read_ledger
 from evopolicy_gateway.run.operations import Operations
 from evopolicy_gateway.run.plan import Plan
 from evopolicy_gateway.run.times import Stopwatch
@@ -142,7 +142,7 @@ def _place_notes(run: OpenRun, ready: Ready) -> list[str]:
     """Facts about the agent's place: for a remote agent, those that the operator passes on to it."""
     if run.plan.listener is None:
         until = "until then no hidden case that this run shares is played while its agent lives"
-        return [] if host.boot_id() else [f"{host.NO_BOOT_ID}; {until}"]
+        return [] if proc.boot_id() else [f"{proc.NO_BOOT_ID}; {until}"]
     return [
         place_notice(run.plan.settings.agent_host, run.folder.root),
         f"the agent is served at {ready.variables['EVOPOLICYGYM_SUBMIT_URL']}",
@@ -242,7 +242,7 @@ class SupervisedAgent(Kept):
         run, terms = self._run, self._terms
         left = {"wall_time_s": round(max(0.0, run.plan.wall_limit_s - run.stopwatch.times.agent_s))}
         if terms is not None and run.folder.model_requests.exists():
-            used = ledger.read(run.folder.model_requests).usage.total
+            used = read_ledger(run.folder.model_requests).usage.total
             left["model_tokens"] = max(0, terms.limits.max_tokens - used)
         with contextlib.suppress(OSError):
             write_atomically(run.folder.left, msgspec.json.encode(left))

@@ -43,11 +43,11 @@ from evopolicy_common.wire import credentials
 from evopolicy_common.wire.credentials import Credentials
 from evopolicy_gateway.http.server import Address
 from evopolicy_gateway.processes.child_messages import Ready
-from evopolicy_gateway.run import record, starts
+from evopolicy_gateway.run import record
 from evopolicy_gateway.run.agent_side import AgentSide
 from evopolicy_gateway.run.children import OpenRun
 from evopolicy_gateway.run.operations import Operations
-from evopolicy_gateway.run.plan import Plan
+from evopolicy_gateway.run.plan import Plan, find_start, stage_start
 from evopolicy_gateway.run.times import Stopwatch
 from evopolicy_gateway.run.watch import View
 from evopolicy_gateway.run_folder.layout import save, saved
@@ -164,7 +164,7 @@ class RunLifecycle:
             plan.claim()
         folder.state.mkdir(mode=0o700)
         if plan.start_from:
-            await asyncio.to_thread(starts.stage, starts.find(plan.start_from, plan.started_in), folder)
+            await asyncio.to_thread(stage_start, find_start(plan.start_from, plan.started_in), folder)
         save(folder.intended, wanted)
         folder.asked.unlink(missing_ok=True)
         if replays is not None:

@@ -39,7 +39,7 @@ from evopolicy_gateway.processes.child_messages import (
     RelayAddress,
     StartRelay,
 )
-from evopolicy_gateway.relay import ledger
+from evopolicy_gateway.relay.limits import read_ledger
 from evopolicy_gateway.relay.service import Order
 from evopolicy_gateway.run import recorded_agent
 from evopolicy_gateway.run.children import Kept, OpenRun
@@ -93,7 +93,7 @@ class ModelRelay(Kept):
             # SIGTERM ends its jail with everything in it. It counts the answers that still come, and ends.
             await self._child.finish(grace_s)
         await super().end(grace_s)
-        plan, used = self._run.plan, ledger.read(self._run.folder.model_requests)
+        plan, used = self._run.plan, read_ledger(self._run.folder.model_requests)
         config = plan.known_config
         tokens = used.recorded(None if config is None else config.prices)
         self._run.note(f"model use: {used.requests:,} requests ({used.failed:,} failed), {use_words(tokens)}")

@@ -7,31 +7,90 @@ import hashlib
 import os
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import msgspec
 
 from evopolicy_common import catalogue
 from evopolicy_common.errors import ConfigError, EvopolicyError, ProtocolError
 from evopolicy_common.messages.environment import StepLimit
-from evopolicy_common.messages.run_settings import RunSettings
+from evopolicy_common.messages.run_settings import RunSettings, Start
 from evopolicy_common.processes.preflight import check_installed, check_loopback, check_text, check_writable
 from evopolicy_common.processes.scratch import remove_tree
 from evopolicy_common.records.model_record import Level
-from evopolicy_common.records.open_run import IntendedRun
+from evopolicy_common.records.open_run import IntendedRun, OpenedRun
+from evopolicy_common.records.policies import trees
+from evopolicy_common.records.policies.trees import Tree
 from evopolicy_common.records.run_files import read_record
-from evopolicy_common.records.run_record import AgentLimits
-from evopolicy_gateway import harnesses
+from evopolicy_common.records.run_record import AgentInput, AgentLimits, inputs_digest
+from evopolicy_common.regular_files import read_given
+from evopolicy_gateway import harnesses, shipped
 from evopolicy_gateway.harnesses.coding_agents import llm
 from evopolicy_gateway.harnesses.interface.agent_config import USUAL_COST, AgentConfig
 from evopolicy_gateway.harnesses.interface.base import Harness
+from evopolicy_gateway.inputs import declared as inputs
 from evopolicy_gateway.jail.settings import JailSettings
 from evopolicy_gateway.processes.clock import SILENCE_S
 from evopolicy_gateway.relay.usage import Prices
-from evopolicy_gateway.run.texts import Texts
-from evopolicy_gateway.run_folder.layout import RunFolder, run_folder, saved
+from evopolicy_gateway.run_folder.layout import RunFolder, run_folder, save, saved
 from evopolicy_gateway.run_folder.listener import Listener, check_agent
 from evopolicy_gateway.run_folder.locks import check_free
+from evopolicy_gateway.workspace import prompts as workspace_prompts
+from evopolicy_gateway.workspace.agents_md import PLACEHOLDERS
+from evopolicy_gateway.workspace.prompts import Prompts, read_prompts, read_text
+
+
+class Texts(msgspec.Struct, frozen=True, kw_only=True):
+    """The texts of one run."""
+
+    agents_md: str = ""
+    """In place of `AGENTS.md`; empty: the standard text."""
+    prompts: Prompts = Prompts()
+    inputs: tuple[AgentInput, ...] = ()
+    """Skills and MCP servers."""
+
+    @property
+    def digests(self) -> dict[str, Any]:
+        """By their names in `RunSettings`: SHA-256, hex; empty for a standard text."""
+        text = hashlib.sha256(self.agents_md.encode()).hexdigest() if self.agents_md else ""
+        return {"agents_md": text, "prompts": self.prompts.digest, "inputs": inputs_digest(self.inputs)}
+
+
+def read_texts(
+    agents_md: str | Path | None, prompts: str | Path | None, config: AgentConfig | None, started_in: Path
+) -> Texts:
+    """The texts in these files; without `prompts` those of `config`. ConfigError names the file."""
+    text, chosen = "", (None if config is None else config.prompts) or Prompts()
+    if agents_md is not None:
+        path = shipped.found(agents_md, started_in)
+        text = read_text(path)
+        workspace_prompts.check_text(str(path), text, PLACEHOLDERS)
+    if prompts is not None:
+        chosen = read_prompts(shipped.found(prompts, started_in))
+    declared = () if config is None else inputs.read(config.skills, config.mcp, started_in)
+    return Texts(agents_md=text, prompts=chosen, inputs=tuple(each.recorded for each in declared))
+
+
+def read_prices(file: str | Path | None, config: AgentConfig | None, started_in: Path) -> Prices | None:
+    """Prices of the agent's model in a file; None without file or settings. ConfigError names the file."""
+    if file is None or config is None:
+        return None
+    path = shipped.found(file, started_in)
+    try:
+        tables = msgspec.toml.decode(read_given(path, f"--set prices={path}"), type=dict[str, Prices])
+    except (msgspec.DecodeError, UnicodeDecodeError) as error:
+        raise ConfigError(f"--set prices={path}: {error}") from error
+    if config.model is None:
+        raise ConfigError(
+            f"--set prices={path}: the agent's model is not named; write it as in codex:gpt-5.5, or in its file"
+        )
+    if config.model not in tables:
+        raise ConfigError(
+            f'--set prices={path} has no prices for {config.model}: add a table ["{config.model}"] with input and'
+            " output, in US dollars per million tokens"
+        )
+    return tables[config.model]
+
 
 WALL_S = 12 * 3600.0
 """Default wall limit of an agent, seconds."""
@@ -269,3 +328,53 @@ def _unusual(values: dict[str, Any], usual: dict[str, Any]) -> dict[str, Any]:
         if isinstance(value, dict) and isinstance(usual.get(name), dict):
             unusual[name] = _unusual(value, usual[name])
     return unusual
+
+
+class StartPoint(NamedTuple):
+    """A start, and where its files are."""
+
+    start: Start
+    folder: RunFolder
+    """Of the earlier run."""
+    submit: str
+    tree: Tree
+
+
+def find_start(text: str, started_in: Path) -> StartPoint:
+    """The submit that `RUN@submit_NNN` names, RUN relative to `started_in`. ConfigError that names the fault."""
+    place, _, submit = text.rpartition("@")
+    number = trees.submit_number(submit)
+    if not place or number is None:
+        raise ConfigError(
+            f"--start-from {text!r}: use the form RUN@submit_NNN, such as"
+            " runs/evolve/gym_acrobot/first@submit_007"
+        )
+    folder = RunFolder((started_in / place).absolute())
+    try:
+        # A folder of another user's making could name any run and hold any files.
+        if folder.root.stat().st_uid != os.getuid():
+            raise ConfigError(
+                f"--start-from {text}: {folder.root} belongs to another user; name a run of your own"
+            )
+        finished = folder.run_json.exists()
+        run = read_record(folder.root).run if finished else saved(folder.opened_run, OpenedRun).run
+    except OSError as error:
+        raise ConfigError(
+            f"--start-from {text}: no run is there: {error.strerror}; name a run directory"
+        ) from error
+    tree, digest = trees.read(folder.root, submit)
+    if not (folder.feedback / submit).is_dir():
+        raise ConfigError(f"--start-from {text}: the submit has no feedback yet; wait until it is played")
+    return StartPoint(Start(run=run, submit_index=number, tree=digest), folder, submit, tree)
+
+
+def stage_start(point: StartPoint, folder: RunFolder) -> None:
+    """Makes the workspace of a new run. StorageError for a missing content, and where the disk refuses."""
+    start, source, submit, tree = point
+    folder.workspace.mkdir()
+    trees.restore(source.root, tree, folder.workspace)
+    omitted = trees.copy_history(source.feedback, source.history, start.submit_index, folder.history)
+    folder.history.mkdir(exist_ok=True)
+    about = {"submit": submit, "omitted": omitted}
+    (folder.history / "START.json").write_bytes(msgspec.json.format(msgspec.json.encode(about)) + b"\n")
+    save(folder.start, start)

@@ -43,7 +43,7 @@ from evopolicy_common.records.run_record import RunRecord, encode_run_record, sh
 from evopolicy_common.records.secrets import without_keys
 from evopolicy_common.records.summary import utc_text
 from evopolicy_gateway.harnesses.coding_agents import session
-from evopolicy_gateway.relay import ledger
+from evopolicy_gateway.relay import limits as model_limits
 from evopolicy_gateway.run import replays
 from evopolicy_gateway.run.operations import Operations
 from evopolicy_gateway.run.plan import Plan
@@ -272,7 +272,7 @@ def _complete(folder: RunFolder, plan: Plan, facts: dict[str, Any]) -> dict[str,
     own = facts.get("tokens") or (state.usage.recorded(terms.prices) if state.usage.total else None)
     if not folder.model_requests.exists():
         return known | {"tokens": own, "model_use": schema.ModelUse(metering="agent", limits=limits)}
-    used = ledger.read(folder.model_requests, terms.model)
+    used = model_limits.read_ledger(folder.model_requests, terms.model)
     answered = used.requests - used.failed
     known["model_string"] = known.get("model_string") or max(
         used.models, key=used.models.__getitem__, default=None

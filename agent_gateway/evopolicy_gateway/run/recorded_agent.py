@@ -25,7 +25,7 @@ from evopolicy_common.records.secrets import without_keys
 from evopolicy_common.regular_files import read_regular
 from evopolicy_common.wire.credentials import state_home
 from evopolicy_common.wire.http import bound
-from evopolicy_gateway.relay.replaying import DIFFERENCE
+from evopolicy_gateway.relay.recording import DIFFERENCE
 from evopolicy_gateway.run.plan import Plan, Replays
 from evopolicy_gateway.run_folder.layout import RunFolder
 

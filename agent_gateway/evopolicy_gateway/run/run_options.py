@@ -26,9 +26,7 @@ from evopolicy_gateway import harnesses
 from evopolicy_gateway.declared import Count, Option, Several
 from evopolicy_gateway.harnesses.interface.agent_config import AgentConfig
 from evopolicy_gateway.processes.clock import SILENCE_S
-from evopolicy_gateway.run import starts, texts
-from evopolicy_gateway.run.plan import WALL_S, Plan
-from evopolicy_gateway.run.texts import Texts
+from evopolicy_gateway.run.plan import WALL_S, Plan, Texts, find_start, read_prices, read_texts
 from evopolicy_gateway.run_folder.listener import Listener, listener_of
 from evopolicy_gateway.submits.submit_request import Bounds, ids_in
 
@@ -243,7 +241,7 @@ class RunOptions(PolicyPart, frozen=True, kw_only=True):
     def texts(self, started_in: Path, config: AgentConfig | None = None) -> Texts:
         """The texts of the agent, or of its settings in a suite file. ConfigError names the file."""
         known = config or harnesses.config_of(self.agent, started_in)
-        return texts.read(self.agents_md, self.prompts, known, started_in)
+        return read_texts(self.agents_md, self.prompts, known, started_in)
 
     def settings(
         self, env: str, exp_id: str, agent_host: str = "", texts: Texts | None = None, **notes: str
@@ -305,7 +303,7 @@ class RunOptions(PolicyPart, frozen=True, kw_only=True):
         """The run with these settings. `config`: as for `texts`; `more`: of the plan. Raises ConfigError."""
         known = config or harnesses.config_of(self.agent, started_in)
         if self.start_from is not None:
-            origin = starts.find(self.start_from, started_in)
+            origin = find_start(self.start_from, started_in)
             settings = msgspec.structs.replace(settings, start=origin.start)
             more["start_from"] = f"{origin.folder.root}@{origin.submit}"
         more |= {
@@ -314,7 +312,7 @@ class RunOptions(PolicyPart, frozen=True, kw_only=True):
         return Plan(
             settings=settings,
             config=config,
-            prices=texts.read_prices(self.prices, known, started_in),
+            prices=read_prices(self.prices, known, started_in),
             limits=self._agent_limits(),
             started_in=started_in,
             wall_limit_s=self.agent_wall_s,

@@ -21,7 +21,7 @@ import msgspec
 
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.messages.run_settings import ELSEWHERE
-from evopolicy_common.processes import host
+from evopolicy_common.processes import proc
 from evopolicy_common.records.open_run import IntendedRun
 from evopolicy_common.wire.credentials import host_and_port
 from evopolicy_gateway.run_folder.layout import RunFolder, saved
@@ -109,7 +109,7 @@ def _boot_id(named: str, other: str, when: str = "") -> str:
 def agent_place(folder: RunFolder) -> AgentPlace:
     """The place of an open run's agent: the gateway's kernel, unless the agent is started elsewhere."""
     if not folder.listener.exists():
-        return AgentPlace(boot_id=host.boot_id(), host=platform.node())
+        return AgentPlace(boot_id=proc.boot_id(), host=platform.node())
     named = _agent_host(folder)
     return AgentPlace(boot_id="" if named == ELSEWHERE else named)
 

@@ -7,7 +7,7 @@ from string import Template
 import msgspec
 
 from evopolicy_common.messages.gateway import FeedbackDetail, RunOpened
-from evopolicy_common.records.canary import CANARY
+from evopolicy_common.records.words import CANARY
 from evopolicy_gateway.run_folder.layout import episode_name, submit_id
 from evopolicy_gateway.submits.episode_files import episode_share, shows_texts
 

@@ -26,7 +26,7 @@ from evopolicy_common.catalogue import installs
 from evopolicy_common.cli.conventions import FAILURE, USAGE_ERROR
 from evopolicy_common.errors import ConfigError, EvopolicyError
 from evopolicy_common.messages.episode import Tier
-from evopolicy_common.processes import host
+from evopolicy_common.processes import proc
 from evopolicy_common.processes.child_process import ChildProcess, last_words
 from evopolicy_common.processes.notices import notify_if_slow, notify_of_many_slots
 from evopolicy_common.processes.preflight import LOCAL, check_installed, check_scratch, check_writable
@@ -106,7 +106,7 @@ async def _start_workers(
         program += [*options, *_options([("--env", catalogue.source_of(env_id)) for env_id in env_ids])]
         program += _options([("--need-tier", tier) for tier in sorted(wanted.tiers)])
         own = "" if python == sys.executable else f"-{Path(python).parents[1].name}"
-        program += ["--name", name := host.new_worker_name(), *_options([("--slots", wanted.slots)])]
+        program += ["--name", name := proc.new_worker_name(), *_options([("--slots", wanted.slots)])]
         await processes.keep_up(f"worker{own}", program, locks / name)
 
 

@@ -1,4 +1,8 @@
-"""Files of single installed packages, for jails that show those alone and never a folder of all installed packages."""
+"""Files of single installed packages, for jails that show those alone and never a folder of all installed packages.
+
+Only a worker's environment process may have packages that simulate (`SIMULATORS`): with one of them a policy could look
+ahead, and an agent could train outside its budget. The sandboxes of policies and the jails of agents hide them.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +16,15 @@ from pathlib import Path
 
 from evopolicy_common.catalogue import ENTRY_POINTS
 from evopolicy_common.errors import ConfigError
-from evopolicy_common.simulators import SIMULATORS
+
+_NAMES = """
+gymnasium gymnasium_robotics gym mujoco mujoco_py Box2D box2d minigrid highway_env pygame ale_py miniworld
+mo_gymnasium metaworld browsergym miniwob pettingzoo dm_control labmaze shimmy pybullet pybullet_envs nle minihack retro
+stable_retro crafter vizdoom
+"""
+SIMULATORS = tuple(_NAMES.split())
+"""Import names, or names of their files in a Python installation."""
+
 
 POLICY = "policy"
 """Name in a fingerprint of the packages that policies may import."""

@@ -4,6 +4,10 @@ from __future__ import annotations
 
 import contextlib
 import os
+import platform
+import secrets
+import socket
+import subprocess
 import time
 from collections.abc import Collection
 from pathlib import Path
@@ -124,3 +128,28 @@ def proportional_bytes(pid: int) -> int | None:
     among them. Bytes; None where the kernel does not show it."""
     size = number(f"/proc/{pid}/smaps_rollup", "Pss")
     return None if size is None else size << 10
+
+
+_BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
+
+NO_BOOT_ID = f"the kernel does not show its boot id: mount /proc so that {_BOOT_ID} can be read"
+"""Why a worker plays no hidden episodes, and why an agent counts as being on every kernel."""
+
+
+def new_worker_name() -> str:
+    """The host's name with a random suffix."""
+    return f"{socket.gethostname().split('.')[0][:40] or 'worker'}-{secrets.token_hex(3)}"
+
+
+def boot_id() -> str:
+    """The running kernel's id, new at every boot and equal in all its containers; empty if it is not available."""
+    try:
+        return _BOOT_ID.read_text(encoding="ascii").strip()
+    except (OSError, UnicodeDecodeError):
+        pass
+    if platform.system() != "Darwin":
+        return ""
+    done = subprocess.run(
+        ["sysctl", "-n", "kern.bootsessionuuid"], capture_output=True, text=True, check=False
+    )
+    return done.stdout.strip().lower() if done.returncode == 0 else ""

@@ -8,11 +8,14 @@ from __future__ import annotations
 
 import itertools
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
+import msgspec
 import numpy as np
 import orjson
+
+from evopolicy_common.errors import DECODE_ERRORS
 
 
 def json_bytes(value: Any) -> bytes:
@@ -121,3 +124,14 @@ def as_lists(value: Any) -> Any:
     if isinstance(value, tuple | list):
         return [as_lists(item) for item in value]
     return value
+
+
+def objects(lines: Iterable[bytes]) -> Iterator[dict[str, Any]]:
+    """The JSON objects among the lines, in order; all other lines are skipped."""
+    for line in lines:
+        try:
+            value = msgspec.json.decode(line)
+        except DECODE_ERRORS:
+            continue
+        if isinstance(value, dict):
+            yield value

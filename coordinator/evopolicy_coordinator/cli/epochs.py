@@ -24,8 +24,7 @@ from evopolicy_coordinator.pki.identity import public_key, sign
 from evopolicy_coordinator.storage.engines import place_of
 from evopolicy_coordinator.storage.state_folder import StateFolder
 from evopolicy_coordinator.storage.store import Reader
-from evopolicy_results.publish.contents import Countersignature, document, head_digest
-from evopolicy_results.publish.signatures import HEAD
+from evopolicy_results.publish.contents import SIGNED_HEAD, Countersignature, document, head_digest
 
 _PAGE_BYTES = 1 << 20
 
@@ -87,7 +86,7 @@ def countersign(
     head: Annotated[
         str,
         typer.Argument(
-            metavar="HEAD",
+            metavar="SIGNED_HEAD",
             help="Head of another coordinator's journal: 64 hexadecimal digits.",
             show_default=False,
         ),
@@ -106,7 +105,7 @@ def countersign(
     if out.exists():
         raise ConfigError(f"--out {out} is there already; name a new file")
     at = round(time.time(), 3)
-    key, signature = sign(root, head_digest(head.lower(), at), HEAD)
+    key, signature = sign(root, head_digest(head.lower(), at), SIGNED_HEAD)
     signed = Countersignature(head=head.lower(), at=at, key=key, signature=signature)
     write_atomically(out, document(signed))
     say(f"{out}: signed by {key}")

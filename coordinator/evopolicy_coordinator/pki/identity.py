@@ -13,7 +13,7 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from cryptography.hazmat.primitives.serialization import Encoding, PublicFormat
 
 from evopolicy_coordinator.splits import load_or_create_secret
-from evopolicy_results.publish.signatures import MANIFEST
+from evopolicy_results.publish.contents import SIGNED_MANIFEST
 
 SIGNING_KEY = "signing-key"
 """File of the state folder: 32 random bytes, mode 0600."""
@@ -31,7 +31,7 @@ def of_run(state: Path, what: str, key: str) -> bytes:
     return hmac.digest(load_or_create_secret(state / SIGNING_KEY), message, "sha256")
 
 
-def sign(state: Path, digest: str, kind: bytes = MANIFEST) -> tuple[str, str]:
+def sign(state: Path, digest: str, kind: bytes = SIGNED_MANIFEST) -> tuple[str, str]:
     """Signs a SHA-256 (hex). Returns the public key (64 hex digits) and the signature (128)."""
     key = Ed25519PrivateKey.from_private_bytes(load_or_create_secret(state / SIGNING_KEY))
     public = key.public_key().public_bytes(Encoding.Raw, PublicFormat.Raw).hex()

@@ -19,8 +19,8 @@ import msgspec
 from evopolicy_common import catalogue
 from evopolicy_common.errors import ConfigError, DamagedStoreError, LeadLostError, StorageError
 from evopolicy_common.logs import structlog
+from evopolicy_common.processes.packages import SIMULATORS
 from evopolicy_common.records.blobs import BlobStore
-from evopolicy_common.simulators import SIMULATORS
 from evopolicy_common.wire import credentials, transport
 from evopolicy_common.wire.credentials import Ready
 from evopolicy_coordinator.core.contract.settings import CoreSettings

@@ -15,8 +15,7 @@ import msgspec
 from evopolicy_common.processes.left_files import left_files
 from evopolicy_common.regular_files import read_regular
 from evopolicy_results.behaviour.edits import Transition, classify
-from evopolicy_results.code.line_diff import unified
-from evopolicy_results.code.sources import read_python_files
+from evopolicy_results.code.sources import read_python_files, unified
 from evopolicy_results.reading.agent_log import Evidence, LogReading, read_agent_log
 from evopolicy_results.reading.records import Run, Submit
 

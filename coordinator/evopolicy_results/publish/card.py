@@ -22,10 +22,10 @@ from evopolicy_common import catalogue
 from evopolicy_common.catalogue.installs import Licence, family_of, licences
 from evopolicy_common.records import journal
 from evopolicy_common.records.aggregates import mean
-from evopolicy_common.records.canary import CANARY
 from evopolicy_common.records.journal import Result
 from evopolicy_common.records.run_record import RunRecord
 from evopolicy_common.records.summary import utc_text
+from evopolicy_common.records.words import CANARY
 from evopolicy_common.statistics.intervals import Estimate
 from evopolicy_results.publish import contents
 from evopolicy_results.scoring import scores

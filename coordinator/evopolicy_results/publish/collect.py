@@ -25,7 +25,6 @@ import numpy as np
 from evopolicy_common.errors import ConfigError, EvopolicyError, RefusedError
 from evopolicy_common.messages.environment import Split
 from evopolicy_common.records import journal
-from evopolicy_common.records.canary import CANARY
 from evopolicy_common.records.episodes.rendered import decode
 from evopolicy_common.records.episodes.trajectory import Recorder, Trajectory
 from evopolicy_common.records.journal import Result, SubmitResult
@@ -34,6 +33,7 @@ from evopolicy_common.records.policies.checkpoints import bundle_of
 from evopolicy_common.records.run_files import read_or_reason, run_folders
 from evopolicy_common.records.run_record import RunRecord, decode_run_record, encode_run_record
 from evopolicy_common.records.secrets import Passed, read_passed
+from evopolicy_common.records.words import CANARY
 from evopolicy_common.regular_files import read_regular
 from evopolicy_common.wire.operator_client import TIMEOUT_S, OperatorClient
 from evopolicy_common.wire.transport import Link

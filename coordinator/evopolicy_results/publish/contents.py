@@ -23,6 +23,8 @@ import operator
 from collections.abc import Iterable, Sequence
 
 import msgspec
+from cryptography.exceptions import InvalidSignature
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
 
 from evopolicy_common.errors import DECODE_ERRORS, ProtocolError
 from evopolicy_common.messages.bounds import Int, Many, Number, Word
@@ -238,3 +240,17 @@ def completeness(listed: Sequence[Listed]) -> str:
         f"{len(omitted)} of {len(listed)} runs of these entries and their starts are left out ({states}): these runs"
         " were selected"
     )
+
+
+SIGNED_MANIFEST, SIGNED_HEAD = b"evopolicy manifest 1\0", b"evopolicy head 1\0"
+"""Prefixes of the signed bytes: a signature of one kind is not valid for the other."""
+
+
+def signed_by(key: str, signature: str, digest: str, kind: bytes = SIGNED_MANIFEST) -> bool:
+    """Whether the owner of the public `key` signed the `digest`; False for anything malformed."""
+    try:
+        public = Ed25519PublicKey.from_public_bytes(bytes.fromhex(key))
+        public.verify(bytes.fromhex(signature), kind + bytes.fromhex(digest))
+    except (InvalidSignature, ValueError):
+        return False
+    return True

@@ -15,16 +15,22 @@ from typing import TypeVar
 
 from evopolicy_common.errors import ProtocolError
 from evopolicy_common.records import journal
-from evopolicy_common.records.canary import CANARY
 from evopolicy_common.records.journal import Ended, Opened
 from evopolicy_common.records.summary import utc_text
+from evopolicy_common.records.words import CANARY
 from evopolicy_common.terminal import counted
 from evopolicy_results.publish import card as cards
 from evopolicy_results.publish import contents, descriptions, fields
-from evopolicy_results.publish.contents import Countersignature, Manifest, Removed, Signature
+from evopolicy_results.publish.contents import (
+    SIGNED_HEAD,
+    Countersignature,
+    Manifest,
+    Removed,
+    Signature,
+    signed_by,
+)
 from evopolicy_results.publish.findings import KINDS, UPDATE, Checked, Files, History, State, decoded
 from evopolicy_results.publish.run_rules import check_run, check_starts, read_run
-from evopolicy_results.publish.signatures import HEAD, signed_by
 
 T = TypeVar("T")
 
@@ -188,7 +194,7 @@ def _order(
         head, by = each, "that you gave"
         if isinstance(each, Countersignature):
             head, by = each.head, f"countersigned by {each.key} at {utc_text(each.at)} by its clock"
-            if not signed_by(each.key, each.signature, contents.head_digest(each.head, each.at), HEAD):
+            if not signed_by(each.key, each.signature, contents.head_digest(each.head, each.at), SIGNED_HEAD):
                 yield "failed", f"not a countersignature by {each.key}"
                 continue
             if each.key == signer:

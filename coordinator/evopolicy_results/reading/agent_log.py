@@ -21,7 +21,7 @@ from typing import Any
 import msgspec
 
 from evopolicy_common.records.agent_log import parts
-from evopolicy_common.records.json_lines import objects
+from evopolicy_common.records.json_text import objects
 from evopolicy_common.regular_files import open_regular
 from evopolicy_results.reading.records import Submit
 

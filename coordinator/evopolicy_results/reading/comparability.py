@@ -3,12 +3,14 @@ confinement, and whether hidden episodes and agents shared a kernel.
 
 Settings of `_BY_SUITE` must agree over all runs of a suite, those of `_BY_ENTRY` over the runs of one entry, and those
 of `_BY_ENVIRONMENT` and the library fingerprint over the runs of one environment, since environments differ in them
-anyway. Runs with hidden cases of their own differ in these splits by design.
+anyway. Runs with hidden cases of their own differ in these splits by design. Of a fingerprint's `adapter`
+(`REVISION+DIGEST`) the revision counts; the digest, and that of all of the worker's code, only distinguish workers
+within a run.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from itertools import islice
 from typing import Any, NamedTuple
 
@@ -17,11 +19,22 @@ import msgspec
 from evopolicy_common import catalogue
 from evopolicy_common.errors import EvopolicyError
 from evopolicy_common.messages.environment import Split
-from evopolicy_common.records.fingerprints import comparable
 from evopolicy_common.records.run_record import inputs_digest
 from evopolicy_common.terminal import counted
 from evopolicy_results.reading.environments import grouped, ordered_environments, suites_of
 from evopolicy_results.reading.records import Run, path_text
+
+_CODE = "evopolicy-worker"
+
+
+def comparable(fingerprints: Sequence[Mapping[str, str]]) -> list[dict[str, str]]:
+    """The relevant parts of fingerprints, in order; runs with equal dicts are comparable."""
+    compared = [dict(each) for each in fingerprints]
+    for parts in compared:
+        if "adapter" in parts:
+            del parts[_CODE]
+            parts["adapter"] = parts["adapter"].partition("+")[0]
+    return compared
 
 
 class Mixture(msgspec.Struct, frozen=True, kw_only=True):

@@ -36,8 +36,7 @@ from evopolicy_common.records.run_record import (
 )
 from evopolicy_common.records.splits import SPLITS
 from evopolicy_common.regular_files import read_regular
-from evopolicy_results.code.line_diff import n_changed
-from evopolicy_results.code.sources import reachable_modules, read_python_files, source_digest
+from evopolicy_results.code.sources import n_changed, reachable_modules, read_python_files, source_digest
 from evopolicy_results.code.topology import describe
 from evopolicy_results.reading import published
 from evopolicy_results.reading.parallel import ALONE, Processes

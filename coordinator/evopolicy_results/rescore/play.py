@@ -26,7 +26,6 @@ from evopolicy_common.messages.environment import Case
 from evopolicy_common.messages.episode import EpisodeOutcome
 from evopolicy_common.messages.operator import DescribeEnvironment, Rescore
 from evopolicy_common.records.blobs import write_atomically
-from evopolicy_common.records.fingerprints import comparable
 from evopolicy_common.records.policies.checkpoints import bundle_of
 from evopolicy_common.records.rescores import (
     Rescored,
@@ -41,6 +40,7 @@ from evopolicy_common.records.splits import FILE_STEMS, cases_hash, folder_of, r
 from evopolicy_common.records.words import in_words
 from evopolicy_common.refusals import WRONG_SETTINGS, Refusal
 from evopolicy_results.evaluations import RANDOM, Evaluations, unlike
+from evopolicy_results.reading.comparability import comparable
 from evopolicy_results.reading.records import checkpoint_folder
 
 _FROM_OPTIONS = WRONG_SETTINGS | {Refusal.UNKNOWN_RUN, Refusal.UNKNOWN_SUBMIT, Refusal.MISSING_BUNDLE}

@@ -27,7 +27,7 @@ from statistics import fmean
 import msgspec
 from msgspec.structs import replace
 
-from evopolicy_common.catalogue.anchors import anchor
+from evopolicy_common.catalogue import anchor
 from evopolicy_common.errors import ConfigError
 from evopolicy_results.behaviour.edits import demand_of
 from evopolicy_results.reading.environments import by_name, family_of, grouped, ordered_environments

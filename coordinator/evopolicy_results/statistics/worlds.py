@@ -16,7 +16,7 @@ from statistics import fmean
 import msgspec
 import numpy as np
 
-from evopolicy_common.catalogue.anchors import Anchor, anchor
+from evopolicy_common.catalogue import Anchor, anchor
 from evopolicy_common.catalogue.worlds import unchanged
 from evopolicy_common.statistics.intervals import Estimate, Over
 from evopolicy_results.reading.environments import family_of, grouped

@@ -12,7 +12,7 @@ from evopolicy_common.terminal import counted, duration, number
 from evopolicy_results.reading.environments import title_of
 from evopolicy_results.reading.records import Run
 from evopolicy_results.scoring.scores import Cell
-from evopolicy_results.statistics.digits import decimals, rounded, valued
+from evopolicy_results.statistics.intervals import decimals, rounded, valued
 from evopolicy_results.statistics.pairs import Pair
 from evopolicy_results.statistics.standings import RankEstimate
 from evopolicy_results.studies.study import Study, Suite

@@ -11,7 +11,7 @@ from evopolicy_results.behaviour.edits import FEATURES, demand_of
 from evopolicy_results.reading.environments import family_of, family_title, grouped, suite_size, title_of
 from evopolicy_results.scoring.evolution import Evolution
 from evopolicy_results.scoring.scores import DEMANDS, Cell, mean_of_all, on_known_scale
-from evopolicy_results.statistics.digits import bounds_text, decimals
+from evopolicy_results.statistics.intervals import bounds_text, decimals
 from evopolicy_results.studies.study import Study, Suite
 from evopolicy_results.tables.run_tables import ENTRY, ENV, HARNESS, RUN, RUNS, one_or_all, tables_of_runs
 from evopolicy_results.tables.statistics_tables import OVER, checkpoints, starts_table, statistics_tables

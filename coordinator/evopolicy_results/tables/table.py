@@ -19,7 +19,7 @@ from msgspec.structs import replace
 from evopolicy_common.statistics.intervals import Estimate
 from evopolicy_common.terminal import csv_cell, number, one_line
 from evopolicy_results.statistics.aggregates import Bounded
-from evopolicy_results.statistics.digits import bounds_text, decimals, rounded
+from evopolicy_results.statistics.intervals import bounds_text, decimals, rounded
 
 Kind = Literal["text", "integer", "number", "percent"]
 INTERVAL = "95 % interval"

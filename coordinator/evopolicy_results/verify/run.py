@@ -25,13 +25,13 @@ from evopolicy_common.records.aggregates import mean
 from evopolicy_common.records.episodes import compare
 from evopolicy_common.records.episodes.rendered import decode
 from evopolicy_common.records.episodes.trajectory import Trajectory
-from evopolicy_common.records.fingerprints import comparable
 from evopolicy_common.records.journal import Result
 from evopolicy_common.records.policies.checkpoints import bundle_of
 from evopolicy_common.records.rescores import FOLDER, rescore_names
 from evopolicy_common.records.splits import SPLITS
 from evopolicy_common.wire.operator_client import TIMEOUT_S
 from evopolicy_results.evaluations import Evaluations, unlike
+from evopolicy_results.reading.comparability import comparable
 from evopolicy_results.verify import numbers
 from evopolicy_results.verify.source import EpisodeList, RunUnderTest
 

@@ -18,7 +18,7 @@ from evopolicy_common.records import journal
 from evopolicy_common.wire.operator_client import OperatorClient
 from evopolicy_common.wire.transport import connect
 from evopolicy_coordinator.storage.backup import back_up
-from evopolicy_results.publish.signatures import signed_by
+from evopolicy_results.publish.contents import signed_by
 
 pytestmark = pytest.mark.system
 

@@ -13,7 +13,7 @@ from gateway_double import Double, gateway_on, opened, prepared, served
 from evopolicy_common.messages.gateway import CloseRun, OpenRun, RequestPermit
 from evopolicy_common.messages.run_settings import ELSEWHERE, RunSettings
 from evopolicy_common.messages.worker import Message
-from evopolicy_common.processes import host
+from evopolicy_common.processes import proc
 from evopolicy_common.records.open_run import IntendedRun
 from evopolicy_gateway.processes import child_messages
 from evopolicy_gateway.run.gateway import Gateway
@@ -58,7 +58,7 @@ def remote(folder: RunFolder, agent_host: str) -> None:
 
 async def test_nothing_is_served_before_the_permit_and_the_operator_hears_why(tmp_path: Path) -> None:
     async with prepared(tmp_path) as (folder, double):
-        await double.score_another_run(host.boot_id())
+        await double.score_another_run(proc.boot_id())
         gateway, events = quiet(folder)
         task = asyncio.create_task(gateway.run())
         await until(lambda: events)
@@ -71,7 +71,7 @@ async def test_nothing_is_served_before_the_permit_and_the_operator_hears_why(tm
         assert not await task
     assert asked(double, OpenRun)[0].asks_permit
     first = asked(double, RequestPermit)[0]
-    assert (first.run, first.boot_id) == (double.run_id, host.boot_id())
+    assert (first.run, first.boot_id) == (double.run_id, proc.boot_id())
 
 
 async def test_gateway_that_is_started_again_asks_again(tmp_path: Path) -> None:
@@ -96,7 +96,7 @@ async def test_a_permit_ended_by_mistake_is_renewed(tmp_path: Path, monkeypatch:
 
 async def test_run_that_is_cancelled_while_it_waits_is_over(tmp_path: Path) -> None:
     async with prepared(tmp_path) as (folder, double):
-        await double.score_another_run(host.boot_id())
+        await double.score_another_run(proc.boot_id())
         gateway, events = quiet(folder)
         task = asyncio.create_task(gateway.run())
         await until(lambda: events)
@@ -107,7 +107,7 @@ async def test_run_that_is_cancelled_while_it_waits_is_over(tmp_path: Path) -> N
 
 async def test_an_ended_agents_gateway_closes_the_run_without_a_permit(tmp_path: Path) -> None:
     async with prepared(tmp_path) as (folder, double):
-        await double.score_another_run(host.boot_id())
+        await double.score_another_run(proc.boot_id())
         gateway, _ = quiet(folder)
         gateway.tell(child_messages.CloseRun(reason="agent_stopped"))
         assert await gateway.run()

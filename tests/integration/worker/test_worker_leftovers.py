@@ -25,7 +25,7 @@ from pathlib import Path
 from evopolicy_common.processes.scratch import scratch_folder
 from evopolicy_worker import capabilities
 from evopolicy_worker.slots.slot import Slot
-from evopolicy_worker.slots.tiers import available_tiers
+from evopolicy_worker.slots.slot import available_tiers
 
 print("begun", flush=True)
 tiers = available_tiers()

@@ -5,11 +5,10 @@ from __future__ import annotations
 from collections import Counter
 
 from evopolicy_coordinator.core.contract.records import submit_group
-from evopolicy_coordinator.core.isolation.kernels import all_related, related
+from evopolicy_coordinator.core.isolation.conflicts import all_related, related
 from evopolicy_coordinator.core.structures import InvariantError
-from evopolicy_coordinator.core.tables.model import N_PRIORITIES, JobState
+from evopolicy_coordinator.core.tables.model import JOB, N_PRIORITIES, RUN, SUBMIT, JobState
 from evopolicy_coordinator.core.tables.state import State
-from evopolicy_coordinator.core.tables.transitions import JOB, RUN, SUBMIT
 
 
 def check_invariants(state: State) -> None:

@@ -19,7 +19,7 @@ from evopolicy_gateway.agent_supervisor.supervisor import secrets_in
 from evopolicy_gateway.harnesses import make
 from evopolicy_gateway.harnesses.interface.agent_config import AgentConfig
 from evopolicy_gateway.harnesses.interface.base import Stage
-from evopolicy_gateway.processes.agent_log import AgentLog
+from evopolicy_gateway.processes.agent_process import AgentLog
 from evopolicy_gateway.processes.child_messages import AgentDoing, AgentEnded
 from evopolicy_gateway.processes.clock import AgentClock
 from stages.loopback import serving_json

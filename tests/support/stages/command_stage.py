@@ -13,8 +13,7 @@ from typing import Any
 
 from evopolicy_gateway.harnesses.command import CommandHarness
 from evopolicy_gateway.harnesses.interface.base import Stage
-from evopolicy_gateway.processes.agent_log import AgentLog
-from evopolicy_gateway.processes.agent_process import environment_of
+from evopolicy_gateway.processes.agent_process import AgentLog, environment_of
 from evopolicy_gateway.processes.child_messages import AgentEnded
 from evopolicy_gateway.processes.clock import Activity
 

@@ -12,8 +12,7 @@ import httpx
 
 from evopolicy_common.wire.http import bound, serving
 from evopolicy_gateway.relay.apis import Protocol, Upstream
-from evopolicy_gateway.relay.ledger import read
-from evopolicy_gateway.relay.limits import Used
+from evopolicy_gateway.relay.limits import Used, read_ledger
 from evopolicy_gateway.relay.service import Order, Relay
 from stages.model_api import ModelApi, Step
 
@@ -44,7 +43,7 @@ class Served:
 
     @property
     def used(self) -> Used:
-        return read(self.ledger)
+        return read_ledger(self.ledger)
 
     async def ask(self, path: str = "chat/completions", **more: Any) -> httpx.Response:
         """Asks for a small answer, with one tool."""

@@ -8,7 +8,6 @@ import proofs
 import pytest
 
 from evopolicy_common import catalogue
-from evopolicy_common.catalogue import anchors
 from evopolicy_common.errors import ConfigError
 
 
@@ -56,12 +55,12 @@ def test_an_unknown_name_is_refused_naming_what_is_near(pattern: str, near: str)
 
 
 def test_anchors_of_core16_and_every_family_have_width_and_a_policy() -> None:
-    found = anchors.anchors()
+    found = catalogue.anchors()
     assert set(catalogue.suites()["core16"].environments) <= set(found)
     assert {each.env for each in proofs.table()} <= set(found)
     for env_id, each in found.items():
         assert each.width > 0.0, env_id
         assert (each.random.high or each.random.mean) < (each.best.low or each.best.mean), env_id
         assert (proofs.FOLDER.parents[1] / each.policy / "policy.py").is_file()
-    assert anchors.anchor("gym/acrobot@w1") == found["gym/acrobot"]
+    assert catalogue.anchor("gym/acrobot@w1") == found["gym/acrobot"]
     assert found["gym/acrobot"].normalised(found["gym/acrobot"].best.mean) == 1.0

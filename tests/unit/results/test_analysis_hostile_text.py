@@ -16,9 +16,8 @@ from invented.run_dirs import write_run
 
 from evopolicy_results import report as writing
 from evopolicy_results.behaviour.trace import Trace
-from evopolicy_results.code import line_diff
-from evopolicy_results.code.line_diff import n_changed, unified
-from evopolicy_results.code.sources import parse, reachable_modules
+from evopolicy_results.code import sources
+from evopolicy_results.code.sources import n_changed, parse, reachable_modules, unified
 from evopolicy_results.reading import agent_log
 from evopolicy_results.reading.agent_log import read_agent_log
 from evopolicy_results.reading.reader import load_runs
@@ -156,7 +155,7 @@ def test_sources_of_lines_that_look_alike_are_compared_in_bounded_time() -> None
     assert n_changed(old, new) == len(old) + len(new) - same_lines
     assert len(unified(old, new)) == 1 + len(old) + len(new)
     assert n_changed(["same"] * 100_000, ["same"] * 99_999) == 1
-    assert len(old) ** 2 / 2 > line_diff.MAX_STEPS
+    assert len(old) ** 2 / 2 > sources.MAX_STEPS
 
 
 def test_an_import_of_endless_parts_is_read_in_bounded_memory() -> None:

@@ -13,7 +13,7 @@ from invented.study import write_suite
 from evopolicy_common.statistics.intervals import Estimate
 from evopolicy_results.figures.scores import overview
 from evopolicy_results.notebook import study, tables_of
-from evopolicy_results.statistics.digits import bounds_text, valued
+from evopolicy_results.statistics.intervals import bounds_text, valued
 from evopolicy_results.studies.answers import answers_of
 from evopolicy_results.studies.palette import looks
 

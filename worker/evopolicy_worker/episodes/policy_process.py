@@ -22,7 +22,7 @@ from typing import Any, NamedTuple
 from evopolicy_common.errors import SandboxError, SlotDiedError
 from evopolicy_common.messages.episode import FailureCategory, PolicyFailure, ResourceLimits
 from evopolicy_common.processes import proc
-from evopolicy_common.simulators import SIMULATORS
+from evopolicy_common.processes.packages import SIMULATORS
 from evopolicy_worker.episodes import frames
 from evopolicy_worker.episodes.monitor import STOPPED_S, Monitor, Verdict, Watch
 from evopolicy_worker.sandbox import zygote as zygotes

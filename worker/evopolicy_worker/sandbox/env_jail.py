@@ -27,7 +27,7 @@ from evopolicy_common.catalogue import Entry
 from evopolicy_common.errors import SandboxError
 from evopolicy_common.messages.episode import Tier
 from evopolicy_common.processes.scratch import remove_tree
-from evopolicy_common.seccomp.numbers import SECCOMP
+from evopolicy_common.seccomp import SECCOMP
 from evopolicy_worker.environments import defined, process_environment
 from evopolicy_worker.environments.interface import calls
 from evopolicy_worker.environments.interface.settings import BROWSER

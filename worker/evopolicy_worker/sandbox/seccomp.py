@@ -37,13 +37,16 @@ from evopolicy_common.seccomp import (
     JUMP_EQUAL,
     KILLED,
     LOAD,
+    NUMBERS,
+    REACHING_OUT,
+    REFUSED,
+    SOCKET,
     Instruction,
     argument,
     one_of,
     program,
     refuse,
 )
-from evopolicy_common.seccomp.numbers import NUMBERS, REACHING_OUT, REFUSED, SOCKET
 
 PID_MARK = 0x7FFFABCD
 """Placeholder in the filter for the pid of the process that installs it. It is the last word of an 8-byte

@@ -16,7 +16,8 @@ import contextlib
 import os
 import signal
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -36,7 +37,7 @@ from evopolicy_common.messages.environment import EnvironmentDescription
 from evopolicy_common.messages.episode import EpisodeOutcome, Job, PolicyFailure, Tier
 from evopolicy_common.processes import proc
 from evopolicy_common.processes.child_process import ignore_broken_stdin
-from evopolicy_common.processes.scratch import remove_tree
+from evopolicy_common.processes.scratch import remove_tree, scratch_folder
 from evopolicy_worker.environments.interface.calls import NOTE, USUAL, Limits, hung, last_words
 from evopolicy_worker.environments.registry import remembers
 from evopolicy_worker.episodes.monitor import is_stopped
@@ -473,3 +474,43 @@ def _kill(process: asyncio.subprocess.Process | None) -> None:
             # The whole group: the sandbox dies with its parent, but simulators' helper processes only with
             # the group.
             os.killpg(process.pid, signal.SIGKILL)
+
+
+SANDBOXED: tuple[Tier, ...] = ("bwrap", "landlock")
+"""Tiers that confine policies, strongest first."""
+
+
+def available_tiers(*, unsandboxed: bool = False, wanted: Collection[str] = SANDBOXED) -> tuple[Tier, ...]:
+    """Tiers that this machine offers, strongest first; `none` only with `unsandboxed`.
+
+    `wanted`: the sandboxed tiers to test; each takes about a second. A job names its tier, and nothing falls back to
+    another.
+    """
+    working = [tier for tier in SANDBOXED if tier in wanted and why_not(tier) is None]
+    return (*working, "none") if unsandboxed else tuple(working)
+
+
+@cache
+def why_not(tier: Tier) -> str | None:
+    """Why this tier does not work here, with a remedy; None when it works.
+
+    Starts an environment process in its jail, with the policies' sandbox inside. Call it on the main thread,
+    and not from a coroutine.
+    """
+    with scratch_folder("tier") as folder:
+        # A subfolder, as for a slot: this process holds the lock of `folder` itself.
+        scratch = folder / "slot"
+        try:
+            jail.plan(tier, scratch, ("numpy",))
+            asyncio.run(try_out(Slot(None, tier, scratch)))
+        except (EvopolicyError, OSError) as error:
+            return str(error)
+    return None
+
+
+async def try_out(slot: Slot) -> None:
+    """Starts the slot and closes it. Raises as `Slot.start`."""
+    try:
+        await slot.start()
+    finally:
+        await slot.close()

@@ -22,8 +22,7 @@ import msgspec
 from evopolicy_common.errors import EvopolicyError
 from evopolicy_gateway.inputs.kept import Kept
 from evopolicy_gateway.jail.jail import Jail
-from evopolicy_gateway.processes.agent_log import AgentLog
-from evopolicy_gateway.processes.agent_process import AgentProcess
+from evopolicy_gateway.processes.agent_process import AgentLog, AgentProcess
 from evopolicy_gateway.processes.child_messages import AgentDoing, AgentEnded, RelayAddress
 from evopolicy_gateway.processes.clock import Activity, AgentClock
 from evopolicy_gateway.relay.limits import ModelTerms

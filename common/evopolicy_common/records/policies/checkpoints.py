@@ -14,12 +14,12 @@ import msgspec
 
 from evopolicy_common.errors import DECODE_ERRORS, BundleError, ProtocolError
 from evopolicy_common.messages.bounds import check_plausible
+from evopolicy_common.processes.packages import SIMULATORS
 from evopolicy_common.records.blobs import write_atomically
 from evopolicy_common.records.code_metrics import PUBLISHED_SCHEMA, CodeMetrics, code_metrics
 from evopolicy_common.records.policies import bundles
 from evopolicy_common.records.policies.bundles import Bundle, BundleFile
 from evopolicy_common.regular_files import read_regular
-from evopolicy_common.simulators import SIMULATORS
 
 META = "_meta.json"
 METRICS = "metrics.json"

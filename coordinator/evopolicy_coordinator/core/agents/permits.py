@@ -18,8 +18,8 @@ from evopolicy_common.messages import gateway
 from evopolicy_common.messages.run_settings import ELSEWHERE
 from evopolicy_coordinator.core.contract.reasons import Reason
 from evopolicy_coordinator.core.contract.records import PermitRow, RunRow, RunStateRow
-from evopolicy_coordinator.core.isolation import conflicts, kernels
-from evopolicy_coordinator.core.isolation.kernels import put
+from evopolicy_coordinator.core.isolation import conflicts
+from evopolicy_coordinator.core.isolation.conflicts import put
 from evopolicy_coordinator.core.structures import take
 from evopolicy_coordinator.core.tables.model import Ask, CaseSet, Kernel, Run
 from evopolicy_coordinator.core.tables.state import State
@@ -52,7 +52,7 @@ def places(state: State, run: str) -> set[str]:
 
 def ask(state: State, run: Run, row: PermitRow, step: Step) -> Reason | None:
     """Request a permit, again or for the first time. Returns the reason that it waits for; None when it is granted."""
-    kernel, case_set = kernels.kernel(state, row.boot_id), run.case_set
+    kernel, case_set = conflicts.kernel(state, row.boot_id), run.case_set
     if run.id in kernel.permits.get(case_set, ()):
         return None
     if run.id not in kernel.asks.get(case_set, ()):
@@ -80,7 +80,7 @@ def _grant(state: State, run: str, kernel: Kernel, case_set: CaseSet, step: Step
 def restore(state: State, row: PermitRow, case_set: CaseSet) -> None:
     """Enter a permit."""
     case_set.users += 1
-    kernel = kernels.kernel(state, row.boot_id)
+    kernel = conflicts.kernel(state, row.boot_id)
     put(kernel.permits, case_set, row.run, row)
     state.permits.setdefault(row.run, {})[kernel] = row, case_set
 
@@ -98,9 +98,9 @@ def forget_ask(state: State, run: str, boot_id: str, step: Step) -> None:
     """Remove a permit request that was not repeated, and free the jobs that it barred."""
     ask = state.asks.get((run, boot_id))
     if ask is not None:
-        kernels.freed(state, ask.case_set, step, train_too=False)
+        conflicts.freed(state, ask.case_set, step, train_too=False)
         _withdraw(state, run, ask.kernel, ask.case_set)
-        kernels.tidy(state, ask.kernel)
+        conflicts.tidy(state, ask.kernel)
 
 
 def ask_ended(state: State, key: tuple[str, str], step: Step) -> None:
@@ -142,8 +142,8 @@ def _end(state: State, kernel: Kernel, row: PermitRow, step: Step, why: str) -> 
     take(kernel.permits, case_set, row.run)
     step.persist(msgspec.structs.replace(row, ended_at=step.now))
     step.log("info", "permit_ended", run=row.run, host=row.host, boot_id=row.boot_id, why=why)
-    kernels.freed(state, case_set, step)
-    kernels.tidy(state, kernel)
+    conflicts.freed(state, case_set, step)
+    conflicts.tidy(state, kernel)
     state.case_sets.leave(case_set)
 
 

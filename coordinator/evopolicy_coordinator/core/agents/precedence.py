@@ -19,8 +19,8 @@ Rules that this module owns:
 from __future__ import annotations
 
 from evopolicy_coordinator.core.contract.records import submit_group
-from evopolicy_coordinator.core.isolation import conflicts, kernels
-from evopolicy_coordinator.core.isolation.kernels import all_related
+from evopolicy_coordinator.core.isolation import conflicts
+from evopolicy_coordinator.core.isolation.conflicts import all_related
 from evopolicy_coordinator.core.leasing import leases
 from evopolicy_coordinator.core.structures import take
 from evopolicy_coordinator.core.tables.model import (
@@ -116,7 +116,7 @@ def _reserve(
     kernel = min(there, key=in_the_way)
     reservation = lane.reservations[case_set] = Reservation(kernel, lane, case_set, flows)
     case_set.users += 1
-    kernels.put(kernel.reservations, case_set, str(lane.key), reservation)
+    conflicts.put(kernel.reservations, case_set, str(lane.key), reservation)
     step.dirty[lane] = None
     step.log("info", "hidden_first", env=lane.key[0], boot_id=kernel.boot_id, agents=in_the_way(kernel)[0])
 
@@ -127,14 +127,14 @@ def _release(state: State, reservation: Reservation, step: Step, why: str) -> No
     del lane.reservations[case_set]
     take(kernel.reservations, case_set, str(lane.key))
     step.log("info", "agents_first", env=lane.key[0], boot_id=kernel.boot_id, why=why)
-    kernels.freed(state, case_set, step)
-    kernels.tidy(state, kernel)
+    conflicts.freed(state, case_set, step)
+    conflicts.tidy(state, kernel)
     state.case_sets.leave(case_set)
 
 
 def _train(state: State, lane: Lane, step: Step) -> None:
     """Start or stop counting the time for which submits are held."""
-    there = kernels.serving(state, lane)
+    there = conflicts.serving(state, lane)
     barred = {
         case_set
         for case_set in lane.waiting[TRAIN]

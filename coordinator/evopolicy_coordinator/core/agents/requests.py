@@ -8,8 +8,8 @@ from evopolicy_coordinator.core.agents import permits
 from evopolicy_coordinator.core.contract import events
 from evopolicy_coordinator.core.contract.reasons import NotDoneError, Reason, because
 from evopolicy_coordinator.core.contract.records import PermitRow, RunRow
-from evopolicy_coordinator.core.isolation import conflicts, kernels
-from evopolicy_coordinator.core.structures.polls import Poll
+from evopolicy_coordinator.core.isolation import conflicts
+from evopolicy_coordinator.core.structures.timers import Poll
 from evopolicy_coordinator.core.tables.model import EVERYWHERE, Run
 from evopolicy_coordinator.core.tables.state import State
 from evopolicy_coordinator.core.tables.step import Step
@@ -84,7 +84,7 @@ def requested(state: State, event: events.Requested[gateway.RequestPermit], step
 def answer(state: State, poll: Poll, step: Step) -> None:
     """A gateway's wait for a permit has timed out."""
     _, run, boot_id = poll.target.split(" ", 2)
-    waits_for = conflicts.permit_conflict(state, state.runs[run].case_set, kernels.kernel(state, boot_id))
+    waits_for = conflicts.permit_conflict(state, state.runs[run].case_set, conflicts.kernel(state, boot_id))
     step.reply(poll.request, gateway.Permit(granted=False), waits_for)
 
 

@@ -15,8 +15,8 @@ from collections.abc import Iterable
 
 from evopolicy_common.messages.worker import HeldLease
 from evopolicy_coordinator.core.contract.records import KernelRow
-from evopolicy_coordinator.core.isolation import kernels
-from evopolicy_coordinator.core.isolation.kernels import put, related
+from evopolicy_coordinator.core.isolation import conflicts
+from evopolicy_coordinator.core.isolation.conflicts import put, related
 from evopolicy_coordinator.core.structures import take
 from evopolicy_coordinator.core.tables.model import Lease, Occupancies, Occupancy, Worker
 from evopolicy_coordinator.core.tables.state import State
@@ -64,8 +64,8 @@ def _gone(state: State, occupancy: Occupancy, step: Step) -> None:
     index, case_set = _index(occupancy), occupancy.case_set
     take(index, case_set, occupancy.key)
     if not related(index, case_set):
-        kernels.freed(state, case_set, step, train_too=occupancy.hidden)
-    kernels.tidy(state, occupancy.kernel)
+        conflicts.freed(state, case_set, step, train_too=occupancy.hidden)
+    conflicts.tidy(state, occupancy.kernel)
     state.case_sets.leave(case_set)
 
 
@@ -156,7 +156,7 @@ def forgotten(state: State, worker: Worker) -> None:
     """Remove a worker from its kernel."""
     if state.workers.get(worker.name) is not worker:
         worker.kernel.workers.pop(worker.name, None)
-        kernels.tidy(state, worker.kernel)
+        conflicts.tidy(state, worker.kernel)
 
 
 def load(state: State, known_kernels: Iterable[KernelRow], step: Step) -> None:
@@ -164,7 +164,7 @@ def load(state: State, known_kernels: Iterable[KernelRow], step: Step) -> None:
     may still play there."""
     for known in known_kernels:
         state.known_kernels[known.worker] = known
-        kernel = kernels.kernel(state, known.boot_id)
+        kernel = conflicts.kernel(state, known.boot_id)
         for hidden in (True, False):
             if hidden and not known.boot_id:
                 continue

@@ -9,7 +9,7 @@ Rules that this module owns:
 from __future__ import annotations
 
 from evopolicy_coordinator.core.leasing import fleet, leases
-from evopolicy_coordinator.core.leasing.retry import JobFailure
+from evopolicy_coordinator.core.leasing.jobs import JobFailure
 from evopolicy_coordinator.core.tables.model import JobState, Worker
 from evopolicy_coordinator.core.tables.state import State
 from evopolicy_coordinator.core.tables.step import Step

@@ -20,8 +20,7 @@ from collections.abc import Iterable
 from evopolicy_common.messages import worker as wire
 from evopolicy_coordinator.core.isolation import conflicts, occupancies
 from evopolicy_coordinator.core.leasing import fleet, queue
-from evopolicy_coordinator.core.leasing.jobs import build
-from evopolicy_coordinator.core.leasing.retry import JobFailure, decide
+from evopolicy_coordinator.core.leasing.jobs import JobFailure, build, decide
 from evopolicy_coordinator.core.tables.model import JobGroup, JobState, Lease, Worker
 from evopolicy_coordinator.core.tables.state import State
 from evopolicy_coordinator.core.tables.step import JobRetried, Step

@@ -16,7 +16,7 @@ from evopolicy_coordinator.core.contract.reasons import NotDoneError, Reason
 from evopolicy_coordinator.core.contract.records import EvaluationRow, evaluation_group
 from evopolicy_coordinator.core.leasing import groups, pins
 from evopolicy_coordinator.core.runs import templates, waits
-from evopolicy_coordinator.core.structures.polls import Poll
+from evopolicy_coordinator.core.structures.timers import Poll
 from evopolicy_coordinator.core.tables.model import Evaluation, Flow, JobGroup
 from evopolicy_coordinator.core.tables.state import State
 from evopolicy_coordinator.core.tables.step import EnvironmentFailed, EpisodesDone, FlowPinned, Step

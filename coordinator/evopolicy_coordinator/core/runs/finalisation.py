@@ -28,14 +28,7 @@ from evopolicy_coordinator.core.contract.records import (
     submit_group,
 )
 from evopolicy_coordinator.core.leasing import groups
-from evopolicy_coordinator.core.runs import (
-    evaluations,
-    finished,
-    journal,
-    result_polls,
-    runs,
-    templates,
-)
+from evopolicy_coordinator.core.runs import evaluations, finished, journal, result_polls, runs, templates
 from evopolicy_coordinator.core.tables.model import JobGroup, Run
 from evopolicy_coordinator.core.tables.state import State
 from evopolicy_coordinator.core.tables.step import (

@@ -10,7 +10,7 @@ from evopolicy_coordinator.core.contract.reasons import NotDoneError
 from evopolicy_coordinator.core.contract.records import submit_group
 from evopolicy_coordinator.core.runs import waits
 from evopolicy_coordinator.core.runs.runs import held_s
-from evopolicy_coordinator.core.structures.polls import Poll
+from evopolicy_coordinator.core.structures.timers import Poll
 from evopolicy_coordinator.core.tables.model import JobGroup
 from evopolicy_coordinator.core.tables.state import State
 from evopolicy_coordinator.core.tables.step import Step

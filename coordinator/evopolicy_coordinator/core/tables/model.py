@@ -8,10 +8,10 @@ from __future__ import annotations
 
 import heapq
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Any, Literal, NamedTuple, TypeVar
+from typing import Any, Literal, NamedTuple, TypeVar, get_args
 
 from evopolicy_common.messages.environment import (
     Case,
@@ -28,7 +28,7 @@ from evopolicy_common.messages.episode import (
     ResourceLimits,
     Tier,
 )
-from evopolicy_common.messages.gateway import VideoOption
+from evopolicy_common.messages.gateway import SubmitStatus, VideoOption
 from evopolicy_common.messages.status import RetriedJobs
 from evopolicy_common.messages.worker import Fingerprint
 from evopolicy_common.records.aggregates import mean
@@ -40,8 +40,38 @@ from evopolicy_coordinator.core.contract.records import (
     RunStateRow,
     SubmitRow,
 )
+from evopolicy_coordinator.core.structures import InvariantError
 from evopolicy_coordinator.core.structures.ledger import Ledger
-from evopolicy_coordinator.core.tables.transitions import JOB, Place, check
+
+Table = Mapping[str, Collection[str]]
+"""State to its allowed successors; a final state has none."""
+
+RUN: Table = {
+    "open": ("closed",),  # by its gateway, or by an operator's cancellation
+    "closed": ("finished",),
+    "finished": (),
+}
+
+SUBMIT: Table = {"open": get_args(SubmitStatus), **dict.fromkeys(get_args(SubmitStatus), ())}
+"""An open submit gets any verdict, once; `open` is a status of None."""
+
+Place = Literal["new", "queued", "leased", "backing_off", "adopting", "closed"]
+
+JOB: Table = {
+    "new": ("queued", "adopting"),  # adopting: it may have been running since before the core was loaded
+    "queued": ("leased", "closed"),
+    "leased": ("queued", "backing_off", "closed"),
+    "backing_off": ("queued", "leased", "closed"),  # leased: adopted from its worker's heartbeat
+    "adopting": ("queued", "leased", "closed"),
+    "closed": (),
+}
+
+
+def check(table: Table, key: str, before: str, after: str) -> None:
+    """Raises InvariantError when `after` may not follow `before`. `key` names the changed record in the error."""
+    if after not in table[before]:
+        raise InvariantError(f"{key}: {after} cannot follow {before}")
+
 
 T = TypeVar("T")
 

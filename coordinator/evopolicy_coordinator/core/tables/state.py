@@ -19,8 +19,7 @@ from evopolicy_coordinator.core.contract.records import (
 )
 from evopolicy_coordinator.core.contract.settings import CoreSettings
 from evopolicy_coordinator.core.structures import take
-from evopolicy_coordinator.core.structures.polls import Polls
-from evopolicy_coordinator.core.structures.timers import Timers
+from evopolicy_coordinator.core.structures.timers import Polls, Timers
 from evopolicy_coordinator.core.tables.model import (
     EVERYWHERE,
     RANKS,

@@ -22,7 +22,7 @@ from evopolicy_coordinator.core.contract.effects import Effect, Log, Persist, Re
 from evopolicy_coordinator.core.contract.events import RequestId
 from evopolicy_coordinator.core.contract.reasons import Reason
 from evopolicy_coordinator.core.contract.records import Row, SubmitRow
-from evopolicy_coordinator.core.tables import transitions
+from evopolicy_coordinator.core.tables import model
 from evopolicy_coordinator.core.tables.model import Flow, JobGroup, JobState, Lane, Profile, Run, Worker
 
 # ---- news ----
@@ -182,7 +182,7 @@ class Step:
         """Change a run's stored state; raises InvariantError when the new phase may not follow the old one."""
         before, run.state = run.state, msgspec.structs.replace(run.state, **fields)
         if run.state.phase != before.phase:
-            transitions.check(transitions.RUN, run.id, before.phase, run.state.phase)
+            model.check(model.RUN, run.id, before.phase, run.state.phase)
         self.persist(run.state)
 
     def change_submit(self, run: Run, index: int, **fields: object) -> SubmitRow:
@@ -191,6 +191,6 @@ class Step:
         row = run.submits[index] = msgspec.structs.replace(before, **fields)
         if row.status != before.status:
             key = f"{run.id}/s{index}"
-            transitions.check(transitions.SUBMIT, key, before.status or "open", row.status or "open")
+            model.check(model.SUBMIT, key, before.status or "open", row.status or "open")
         self.persist(row)
         return row

@@ -16,7 +16,7 @@ from evopolicy_common.messages import worker as wire
 from evopolicy_coordinator.core.contract import events
 from evopolicy_coordinator.core.contract.reasons import NotDoneError
 from evopolicy_coordinator.core.contract.records import WorkerRow
-from evopolicy_coordinator.core.isolation import conflicts, kernels, occupancies
+from evopolicy_coordinator.core.isolation import conflicts, occupancies
 from evopolicy_coordinator.core.leasing import fleet, leases, pins
 from evopolicy_coordinator.core.tables.model import Profile, Worker
 from evopolicy_coordinator.core.tables.state import State
@@ -37,7 +37,7 @@ def registered(state: State, event: events.WorkerRegistered, step: Step) -> None
         fleet.drop_poll(state, old, step)
         fleet.answer_beat(state, old, (), step)
     state.timers.disarm(("forget", message.worker))
-    worker = fleet.register(state, event, kernels.kernel(state, message.boot_id), step)
+    worker = fleet.register(state, event, conflicts.kernel(state, message.boot_id), step)
     occupancies.joined(state, worker, step)
     if old is not None and old.kernel is not worker.kernel:
         occupancies.forgotten(state, old)

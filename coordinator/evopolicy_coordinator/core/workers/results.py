@@ -24,8 +24,8 @@ from evopolicy_common.messages.bounds import LARGEST
 from evopolicy_common.messages.episode import TIME_LIMITS, EpisodeOutcome
 from evopolicy_common.messages.worker import JobResult
 from evopolicy_coordinator.core.contract.records import BegunRow, OutcomeRow
-from evopolicy_coordinator.core.leasing import fleet, groups, leases, retry
-from evopolicy_coordinator.core.leasing.retry import JobFailure
+from evopolicy_coordinator.core.leasing import fleet, groups, jobs, leases
+from evopolicy_coordinator.core.leasing.jobs import JobFailure
 from evopolicy_coordinator.core.tables.model import JobState, Lease, Worker, outcome_digest
 from evopolicy_coordinator.core.tables.state import State
 from evopolicy_coordinator.core.tables.step import (
@@ -78,7 +78,7 @@ def _environment_fault(state: State, worker: Worker, job: JobState, error: str, 
     faults.on.add(worker.machine or worker.name)
     names = [name for profile in lane.profiles for name in profile.workers] if lane is not None else []
     able = map(state.workers.__getitem__, names)
-    if retry.in_vain(state.settings, faults, {each.machine or each.name for each in able}, step.now):
+    if jobs.in_vain(state.settings, faults, {each.machine or each.name for each in able}, step.now):
         step.tell(EnvironmentFailed(job.group, f"{error}; {faults.n} attempts at {job.job_id} ended so"))
 
 

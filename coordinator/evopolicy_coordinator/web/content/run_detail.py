@@ -25,7 +25,7 @@ from evopolicy_common.records import open_run
 from evopolicy_common.records.agent_log import Part, parts
 from evopolicy_common.records.blobs import is_digest
 from evopolicy_common.records.episodes.npz import read_arrays
-from evopolicy_common.records.json_lines import objects
+from evopolicy_common.records.json_text import objects
 from evopolicy_common.records.open_run import Accepted, Requested
 from evopolicy_common.records.policies import bundles
 from evopolicy_common.records.policies.checkpoints import METADATA

@@ -22,7 +22,7 @@ from waiting import wait_until
 
 from evopolicy_common.records import model_record
 from evopolicy_common.records.run_record import ModelUse, RunRecord, Tokens
-from evopolicy_gateway.relay.ledger import read
+from evopolicy_gateway.relay.limits import read_ledger
 
 pytestmark = [pytest.mark.system, pytest.mark.slow]
 
@@ -225,7 +225,7 @@ def test_a_kill_loses_no_finished_request(tmp_path: Path, operator: Path, victim
             if victim in ("relay", "supervisor"):
                 assert running.wait() == 0, running.text
         if victim in ("command", "everything"):
-            ledger = read(run_dir(tmp_path) / "logs/model_requests.jsonl")
+            ledger = read_ledger(run_dir(tmp_path) / "logs/model_requests.jsonl")
             assert api.n_asked - ledger.requests <= 1
             with command(tmp_path, *arguments, "--resume") as running:
                 assert running.wait() == 0, running.text

@@ -8,11 +8,11 @@ from pathlib import Path
 
 import pytest
 
-from evopolicy_common.processes import host
+from evopolicy_common.processes import proc
 
 
 def test_boot_id_is_the_kernels_own() -> None:
-    assert host.boot_id() == Path("/proc/sys/kernel/random/boot_id").read_text().strip()
+    assert proc.boot_id() == Path("/proc/sys/kernel/random/boot_id").read_text().strip()
 
 
 def test_boot_id_is_the_same_in_namespaces_of_their_own() -> None:
@@ -22,9 +22,9 @@ def test_boot_id_is_the_same_in_namespaces_of_their_own() -> None:
     read = subprocess.run(
         [*inside, "cat", "/proc/sys/kernel/random/boot_id"], capture_output=True, text=True, check=True
     )
-    assert read.stdout.strip() == host.boot_id()
+    assert read.stdout.strip() == proc.boot_id()
 
 
 def test_kernel_without_an_id_has_an_empty_one(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr(host, "_BOOT_ID", tmp_path / "none")
-    assert host.boot_id() == ""
+    monkeypatch.setattr(proc, "_BOOT_ID", tmp_path / "none")
+    assert proc.boot_id() == ""

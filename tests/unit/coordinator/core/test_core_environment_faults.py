@@ -20,7 +20,7 @@ from evopolicy_common.messages import worker as wire
 from evopolicy_common.messages.environment import Case
 from evopolicy_common.messages.episode import ResourceLimits
 from evopolicy_coordinator.core.contract.records import EvaluationRow, SubmitRow
-from evopolicy_coordinator.core.leasing.retry import FAULTS_MAX
+from evopolicy_coordinator.core.leasing.jobs import FAULTS_MAX
 
 WHY = "environment toy/line, step 7: it has not returned for 300 s"
 

@@ -17,7 +17,7 @@ from evopolicy_common.messages.run_settings import ELSEWHERE
 from evopolicy_common.refusals import Refusal
 from evopolicy_coordinator.core.agents import permits
 from evopolicy_coordinator.core.contract.records import PermitRow
-from evopolicy_coordinator.core.isolation import kernels
+from evopolicy_coordinator.core.isolation import conflicts
 
 HERE = "kernel-of-w1"
 
@@ -186,7 +186,7 @@ def test_a_request_that_is_never_sent_again_is_forgotten(rig: Rig) -> None:
         rig.pass_time(4.0)
         rig.beat(session, *leases)
     assert "validation" in splits(rig.poll(session, 8))
-    assert kernels.kernel(rig.core.state, HERE).asks == {}
+    assert conflicts.kernel(rig.core.state, HERE).asks == {}
 
 
 def test_a_silent_workers_kernel_stays_barred_until_it_has_surely_stopped(rig: Rig) -> None:

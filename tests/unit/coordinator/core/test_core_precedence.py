@@ -10,7 +10,7 @@ from evopolicy_common.messages import worker as wire
 from evopolicy_common.messages.environment import Case
 from evopolicy_common.messages.episode import ResourceLimits
 from evopolicy_coordinator.core.contract.records import OutcomeRow
-from evopolicy_coordinator.core.isolation import kernels
+from evopolicy_coordinator.core.isolation import conflicts
 
 HERE = "kernel-of-w1"
 WAIT_S = 60.0
@@ -203,7 +203,7 @@ def test_an_agent_that_delays_others_is_named_until_its_limit() -> None:
 @pytest.mark.parametrize("why", ["draining", "lost"])
 def test_a_kernel_whose_workers_are_gone_is_turned_back(rig: Rig, why: str) -> None:
     session = waiting(rig)
-    assert kernels.kernel(rig.core.state, HERE).reservations
+    assert conflicts.kernel(rig.core.state, HERE).reservations
     if why == "draining":
         rig.ask(operator.SetWorker, worker="w1", state="draining")
         keep_alive(rig, session, 4.0)

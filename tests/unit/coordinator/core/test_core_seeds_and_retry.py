@@ -10,8 +10,13 @@ from hypothesis import given
 
 from evopolicy_common.messages.environment import Case
 from evopolicy_coordinator.core.contract.settings import CoreSettings
-from evopolicy_coordinator.core.leasing.jobs import occurrences, policy_seed, reference_seed
-from evopolicy_coordinator.core.leasing.retry import backoff_s, decide
+from evopolicy_coordinator.core.leasing.jobs import (
+    backoff_s,
+    decide,
+    occurrences,
+    policy_seed,
+    reference_seed,
+)
 
 SETTINGS = CoreSettings()
 

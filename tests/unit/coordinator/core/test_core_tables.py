@@ -11,10 +11,9 @@ import pytest
 import evopolicy_coordinator.core
 from evopolicy_coordinator.core.machine import NEWS, POLLS, TIMERS
 from evopolicy_coordinator.core.structures import InvariantError
-from evopolicy_coordinator.core.structures.polls import PollKind
+from evopolicy_coordinator.core.structures.timers import PollKind
 from evopolicy_coordinator.core.tables import step
-from evopolicy_coordinator.core.tables.model import GroupKind
-from evopolicy_coordinator.core.tables.transitions import JOB, RUN, SUBMIT, Table, check
+from evopolicy_coordinator.core.tables.model import JOB, RUN, SUBMIT, GroupKind, Table, check
 
 CORE = Path(evopolicy_coordinator.core.__file__).parent
 

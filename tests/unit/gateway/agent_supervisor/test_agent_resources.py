@@ -19,8 +19,7 @@ from stages.supervisor_process import TIMEOUT_S, SupervisorProcess
 
 from evopolicy_common.processes import cgroups
 from evopolicy_common.records.run_record import AgentLimits, AgentResources
-from evopolicy_common.seccomp import ALLOW, ERRNO
-from evopolicy_common.seccomp.numbers import SET_AFFINITY
+from evopolicy_common.seccomp import ALLOW, ERRNO, SET_AFFINITY
 from evopolicy_gateway.jail import entry
 from evopolicy_gateway.jail.jail import JailOrder
 from evopolicy_gateway.jail.settings import JailSettings

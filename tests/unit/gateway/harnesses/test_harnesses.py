@@ -15,8 +15,7 @@ from evopolicy_common.errors import ConfigError
 from evopolicy_gateway.harnesses import entry_name, make
 from evopolicy_gateway.harnesses.command import CommandHarness
 from evopolicy_gateway.harnesses.interface.base import AgentError, Stage
-from evopolicy_gateway.processes.agent_log import MAX_LINE_BYTES, AgentLog
-from evopolicy_gateway.processes.agent_process import environment_of
+from evopolicy_gateway.processes.agent_process import MAX_LINE_BYTES, AgentLog, environment_of
 from evopolicy_gateway.processes.clock import Activity
 
 
@@ -146,7 +145,7 @@ def test_a_flood_of_output_does_not_block_the_program(tmp_path: Path) -> None:
 
 
 def test_the_log_stops_growing_at_its_limit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("evopolicy_gateway.processes.agent_log.MAX_LOG_BYTES", 1000)
+    monkeypatch.setattr("evopolicy_gateway.processes.agent_process.MAX_LOG_BYTES", 1000)
     log = AgentLog(tmp_path / "agent.jsonl")
     for _ in range(200):
         log.raw(b'{"a": 1}', "stdout")

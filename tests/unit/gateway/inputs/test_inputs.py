@@ -23,7 +23,7 @@ from evopolicy_gateway.harnesses.interface.agent_config import AcpTable, AgentCo
 from evopolicy_gateway.inputs import declared
 from evopolicy_gateway.inputs.declared import McpServer, read
 from evopolicy_gateway.inputs.kept import MCP_FILE, Kept, keep
-from evopolicy_gateway.run import texts
+from evopolicy_gateway.run import plan
 
 
 def kept(folder: Path, place: Path) -> Kept:
@@ -160,10 +160,10 @@ def test_inputs_that_change_while_a_run_is_open_are_refused_by_name(tmp_path: Pa
 def test_the_digest_is_a_setting_of_the_run(tmp_path: Path) -> None:
     skills, servers = declare(tmp_path)
     config = AgentConfig(harness="codex", skills=skills, mcp=servers)
-    given = texts.read(None, None, config, tmp_path)
+    given = plan.read_texts(None, None, config, tmp_path)
     assert given.digests["inputs"] == inputs_digest(given.inputs)
     assert len(given.digests["inputs"]) == 64
-    assert texts.read(None, None, AgentConfig(harness="codex"), tmp_path).digests["inputs"] == ""
+    assert plan.read_texts(None, None, AgentConfig(harness="codex"), tmp_path).digests["inputs"] == ""
 
 
 def words_of(folder: Path, config: AgentConfig, options: str = "") -> list[str]:

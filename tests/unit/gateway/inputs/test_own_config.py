@@ -12,7 +12,7 @@ from evopolicy_common.records.secrets import Redaction
 from evopolicy_gateway.harnesses import make
 from evopolicy_gateway.harnesses.interface.agent_config import AcpTable, AgentConfig
 from evopolicy_gateway.inputs.own_config import PLACES, copy, places, secrets
-from evopolicy_gateway.processes.agent_log import AgentLog
+from evopolicy_gateway.processes.agent_process import AgentLog
 
 
 @pytest.fixture

@@ -19,8 +19,7 @@ import pytest
 from machines.filters import allowed
 
 from evopolicy_common.errors import ConfigError
-from evopolicy_common.seccomp import ALLOW, ERRNO
-from evopolicy_common.seccomp.numbers import ATTRIBUTES, MODES
+from evopolicy_common.seccomp import ALLOW, ATTRIBUTES, ERRNO, MODES
 from evopolicy_gateway.jail import syscalls
 from evopolicy_gateway.jail.jail import Jail, JailOrder
 from evopolicy_gateway.jail.settings import JailSettings, Mode

@@ -22,8 +22,7 @@ from stages.relay_stage import GEMINI, KEY, NOON, PATHS, TOKEN, Served, asked, p
 from evopolicy_gateway.relay import service
 from evopolicy_gateway.relay.__main__ import tell
 from evopolicy_gateway.relay.apis import Protocol
-from evopolicy_gateway.relay.ledger import read
-from evopolicy_gateway.relay.limits import Limits, Request, Used
+from evopolicy_gateway.relay.limits import Limits, Request, Used, read_ledger
 from evopolicy_gateway.relay.provider import Provider, Sent
 from evopolicy_gateway.relay.usage import Prices, Usage
 
@@ -125,7 +124,7 @@ def test_other_models_are_told_or_refused(tmp_path: Path) -> None:
     (answer,), served = asked(tmp_path, [], {"model": "other"}, model="m")
     assert answer.status_code == 200
     assert served.notes == ["the agent asks for the model 'other' besides m"]
-    assert read(served.ledger, "m").other_models == {"other": 1}
+    assert read_ledger(served.ledger, "m").other_models == {"other": 1}
     (tmp_path / "strict").mkdir()
     (answer,), served = asked(tmp_path / "strict", [], {"model": "other"}, model="m", declared_only=True)
     assert answer.status_code == 404
@@ -155,7 +154,7 @@ def test_tools_that_the_provider_runs_are_recorded_or_refused(
 ) -> None:
     (answer,), served = asked(tmp_path, [], more, path=api)
     assert answer.status_code == 200
-    assert read(served.ledger).hosted_tools == kinds
+    assert read_ledger(served.ledger).hosted_tools == kinds
     assert len(served.notes) == bool(kinds)
     (tmp_path / "strict").mkdir()
     (answer,), served = asked(tmp_path / "strict", [], more, path=api, own_tools_only=True)

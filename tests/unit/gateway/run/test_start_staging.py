@@ -11,8 +11,7 @@ from gateway_double import opened
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.records.open_run import OpenedRun
 from evopolicy_common.records.policies import bundles, trees
-from evopolicy_gateway.run import starts
-from evopolicy_gateway.run.plan import Plan
+from evopolicy_gateway.run.plan import Plan, find_start, stage_start
 from evopolicy_gateway.run.run_options import RunOptions
 from evopolicy_gateway.run_folder.layout import RunFolder, save
 from evopolicy_gateway.workspace import staging
@@ -50,7 +49,7 @@ def test_a_start_gets_the_recorded_workspace_and_no_hidden_result(parent: RunFol
     assert started.settings.start.tree == trees.read(parent.root, "submit_000")[1]
     started.claim()
     started.folder.state.mkdir()
-    starts.stage(starts.find(started.start_from, tmp_path), started.folder)
+    stage_start(find_start(started.start_from, tmp_path), started.folder)
     staging.stage(started.folder, opened(), NO_URLS)
     workspace = started.folder.workspace
     files = {str(path.relative_to(workspace)) for path in workspace.rglob("*") if path.is_file()}

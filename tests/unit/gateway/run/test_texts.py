@@ -13,12 +13,12 @@ from evopolicy_common.errors import ConfigError
 from evopolicy_gateway.harnesses.coding_agents.llm import listed_prices, prices_of
 from evopolicy_gateway.harnesses.interface.agent_config import AgentConfig, ApiTable
 from evopolicy_gateway.relay.usage import Prices
-from evopolicy_gateway.run.texts import Texts, read, read_prices
+from evopolicy_gateway.run.plan import Texts, read_prices, read_texts
 from evopolicy_gateway.workspace.prompts import FIRST, NEXT_TURN, Prompts
 
 
 def test_without_files_the_texts_are_the_standard_ones_and_have_no_digest(tmp_path: Path) -> None:
-    texts = read(None, None, None, tmp_path)
+    texts = read_texts(None, None, None, tmp_path)
     assert texts == Texts()
     assert texts.digests == {"agents_md": "", "prompts": "", "inputs": ""}
     assert texts.prompts.begin() == FIRST
@@ -30,7 +30,7 @@ def test_without_files_the_texts_are_the_standard_ones_and_have_no_digest(tmp_pa
 def test_texts_replace_or_extend_the_standard_ones(tmp_path: Path) -> None:
     (tmp_path / "p.toml").write_text('first = "$standard Be brief."\ngo_on = "$left left."\n')
     (tmp_path / "rules.md").write_text("My rules.")
-    texts = read("rules.md", "p.toml", None, tmp_path)
+    texts = read_texts("rules.md", "p.toml", None, tmp_path)
     assert texts.prompts.begin() == f"{FIRST} Be brief."
     assert texts.prompts.stopped(3) == texts.prompts.stopped(3, NEXT_TURN) == "3 left."
     assert [len(digest) for digest in texts.digests.values()] == [64, 64, 0]
@@ -39,11 +39,13 @@ def test_texts_replace_or_extend_the_standard_ones(tmp_path: Path) -> None:
 def test_an_agent_files_prompts_count_unless_the_run_has_some(tmp_path: Path) -> None:
     config = AgentConfig(harness="codex", prompts=Prompts(first="hers"))
     (tmp_path / "p.toml").write_text('first = "mine"\n')
-    assert read(None, None, config, tmp_path).prompts.begin() == "hers"
-    assert read(None, "p.toml", config, tmp_path).prompts.begin() == "mine"
+    assert read_texts(None, None, config, tmp_path).prompts.begin() == "hers"
+    assert read_texts(None, "p.toml", config, tmp_path).prompts.begin() == "mine"
     # A digest depends on the texts, not on where they stand.
     (tmp_path / "q.toml").write_text("# a comment\nfirst = 'hers'\n")
-    assert read(None, "q.toml", None, tmp_path).digests == read(None, None, config, tmp_path).digests
+    assert (
+        read_texts(None, "q.toml", None, tmp_path).digests == read_texts(None, None, config, tmp_path).digests
+    )
 
 
 @pytest.mark.parametrize(
@@ -58,7 +60,7 @@ def test_an_agent_files_prompts_count_unless_the_run_has_some(tmp_path: Path) ->
 def test_a_file_of_prompts_that_cannot_be_used_is_named(tmp_path: Path, text: str, fault: str) -> None:
     (tmp_path / "p.toml").write_text(text)
     with pytest.raises(ConfigError, match=fault) as caught:
-        read(None, "p.toml", None, tmp_path)
+        read_texts(None, "p.toml", None, tmp_path)
     assert "p.toml" in str(caught.value)
 
 

@@ -10,7 +10,7 @@ import pytest
 from invented.policies import Version, policy
 from invented.run_dirs import write_run
 
-from evopolicy_common.catalogue.anchors import anchor
+from evopolicy_common.catalogue import anchor
 from evopolicy_common.catalogue.worlds import ids
 from evopolicy_results.report import write_report
 from evopolicy_results.statistics.intervals import mean, of_runs, stratified, stratum, stratum_of

@@ -7,13 +7,13 @@ from pathlib import Path
 
 import pytest
 
-from evopolicy_common.processes import distribution, host
+from evopolicy_common.processes import distribution, proc
 from evopolicy_worker import doctor
 from evopolicy_worker.environments.accelerations import acrobot_scalars, table
 from evopolicy_worker.environments.browser import chromium
 from evopolicy_worker.environments.interface.settings import BROWSER
 from evopolicy_worker.sandbox import jail
-from evopolicy_worker.slots.tiers import why_not
+from evopolicy_worker.slots.slot import why_not
 
 
 def row_of(name: str) -> doctor.Check:
@@ -66,7 +66,7 @@ def test_kernel_that_does_not_tell_its_boot_id_is_reported(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     assert row_of("boot id").verdict == "ok"
-    monkeypatch.setattr(host, "_BOOT_ID", tmp_path / "none")
+    monkeypatch.setattr(proc, "_BOOT_ID", tmp_path / "none")
     check = row_of("boot id")
     assert check.verdict == "missing"
     assert "no hidden episodes" in check.found

@@ -15,7 +15,7 @@ from machines.filters import allowed
 from evopolicy_common import seccomp as bpf
 from evopolicy_common.errors import SandboxError, WorkerError
 from evopolicy_common.records.json_text import json_bytes
-from evopolicy_common.seccomp.numbers import NUMBERS
+from evopolicy_common.seccomp import NUMBERS
 from evopolicy_worker.episodes import frames
 from evopolicy_worker.episodes.monitor import Output
 from evopolicy_worker.sandbox import seccomp

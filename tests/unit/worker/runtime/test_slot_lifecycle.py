@@ -17,8 +17,7 @@ from evopolicy_common.errors import SandboxError, SlotDiedError, WorkerError
 from evopolicy_common.messages.episode import EpisodeOutcome
 from evopolicy_common.processes import distribution
 from evopolicy_worker.sandbox import jail
-from evopolicy_worker.slots.slot import Slot
-from evopolicy_worker.slots.tiers import available_tiers, why_not
+from evopolicy_worker.slots.slot import Slot, available_tiers, why_not
 
 
 def test_a_cancelled_job_returns_at_once_and_the_slot_plays_the_next(slots: Slots) -> None:

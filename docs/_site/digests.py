@@ -1,4 +1,4 @@
-"""Writes the digests of shipped definitions: `python -m evopolicy_worker.environments.checks.digests FILE [ID…]`.
+"""Writes the digests of shipped definitions: `python docs/_site/digests.py FILE [ID…]`.
 
 An environment that cannot be made here, or that is not among the ids (suites, globs), keeps its digest from the file.
 Run it with the versions of `constraints.txt` whenever a definition or a task text changes, and for a family in a
