@@ -8,7 +8,6 @@ import platform
 import secrets
 import socket
 import subprocess
-import time
 from collections.abc import Collection
 from pathlib import Path
 from typing import NamedTuple
@@ -94,15 +93,6 @@ def descendants(root: int, *, spare: Collection[int] = ()) -> list[int]:
 def clock(pid: int) -> int:
     """The clock of a process's own processor time, for `time.clock_gettime`; see clock_getcpuclockid(3)."""
     return (~pid << 3) | 2
-
-
-def cpu_below_s(root: int) -> float:
-    """Processor time that the live processes below `root` have used, seconds."""
-    total = 0.0
-    for each in family(root)[1:]:
-        with contextlib.suppress(OSError):  # it has ended since
-            total += time.clock_gettime(clock(each.pid))
-    return total
 
 
 def sizes(pid: int) -> tuple[int, int] | None:

@@ -293,10 +293,6 @@ class Slot:
         share."""
         return 0 if self._process is None else _memory(self._process.pid)
 
-    def cpu_s(self) -> float:
-        """Processor time that the slot's live processes have used, seconds; policies that have ended are not in it."""
-        return 0.0 if self._process is None else proc.cpu_below_s(self._process.pid)
-
     async def cancel(self) -> None:
         """Stops the running job, if any; its `play` returns, and the slot can be used again."""
         if self._idle.is_set():

@@ -278,12 +278,6 @@ def head(lane: Lane, priority: int) -> JobState | None:
     return None if flow is None else _next(flow, priority)
 
 
-def avoided(lane: Lane, priority: int, now: float) -> str | None:
-    """The worker that the lane's next job avoids; None for none."""
-    job = head(lane, priority)
-    return job.avoid if job is not None and now < job.avoid_until and lane.workers() > 1 else None
-
-
 def next_bundle(lane: Lane) -> tuple[str | None, str] | None:
     """Bundle and environment of the lane's next job; None when none waits."""
     for priority in range(N_PRIORITIES):

@@ -33,14 +33,10 @@ _ACCELERATIONS = "EVOPOLICY_ACCELERATIONS"
 """`off` makes every environment play as its library does it; anything else, or nothing, leaves accelerations on."""
 
 
-def process_environment(*, render: bool = False, accelerations: bool | None = None) -> dict[str, str]:
-    """Variables that a slot process is started with. `render=True` also selects MuJoCo's off-screen renderer.
-
-    `accelerations`: whether `make` uses them in that process; None is as in this process.
-    """
-    variables = dict(_ALWAYS)
-    wanted = accelerations_on() if accelerations is None else accelerations
-    variables[_ACCELERATIONS] = "on" if wanted else "off"
+def process_environment(*, render: bool = False) -> dict[str, str]:
+    """Variables that a slot process is started with; accelerations are as in this process. `render=True` also selects
+    MuJoCo's off-screen renderer."""
+    variables = {**_ALWAYS, _ACCELERATIONS: "on" if accelerations_on() else "off"}
     if render:
         # Without it the second MuJoCo environment that draws aborts the process.
         variables["MUJOCO_GL"] = "egl"
