@@ -47,8 +47,6 @@ SECRET, UNJAILED_SECRET = "secret", "secret-unjailed"
 
 
 class EnvironmentSplits(msgspec.Struct, frozen=True, kw_only=True):
-    """The cases of one environment."""
-
     env: str
     train: tuple[Case, ...]
     validation: tuple[Case, ...]

@@ -46,8 +46,6 @@ class Base(msgspec.Struct, frozen=True, kw_only=True, tag="environment", tag_fie
 
 
 class Candidate(msgspec.Struct, frozen=True, kw_only=True, tag="candidate", tag_field="kind"):
-    """A candidate that was tried."""
-
     epoch: str
     env: str
     number: int
@@ -111,7 +109,6 @@ def number_of(env: str, secret: bytes, journal: Path | None) -> tuple[int, str]:
 
 
 def of_environment(entries: list[Entry], epoch: str, env: str) -> list[Entry]:
-    """The entries of one epoch and environment, in order."""
     return [each for each in entries if each.epoch == epoch and each.env == env]
 
 

@@ -344,7 +344,6 @@ async def _run(
 
 
 def main() -> None:
-    """The program."""
     # Slots inherit these, such as the thread counts of simulators and numpy; see `environments.process_environment`.
     os.environ.update(environments.process_environment())
     if sys.platform != "linux":

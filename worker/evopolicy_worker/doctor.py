@@ -72,8 +72,6 @@ _PLAYS = {
 
 
 class Check(msgspec.Struct, frozen=True):
-    """The result of one check."""
-
     name: str
     verdict: Verdict
     found: str

@@ -28,8 +28,6 @@ _NOTES = ("turn_failed", "paused", "permission", "log_full")
 
 @dataclass(kw_only=True)
 class Call:
-    """A tool call."""
-
     id: str
     """Unique within the log."""
     name: str
@@ -81,8 +79,6 @@ def read_steps(path: Path) -> list[LogStep]:
 
 
 class _Log:
-    """The steps so far."""
-
     def __init__(self) -> None:
         self.steps: list[LogStep] = []
         self._calls: dict[str, tuple[LogStep, Call]] = {}

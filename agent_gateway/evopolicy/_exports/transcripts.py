@@ -191,7 +191,6 @@ def _inspect(run: Run, steps: list[LogStep]) -> dict[str, Any]:
 
 
 def _inspect_messages(step: LogStep, model: str) -> Iterator[dict[str, Any]]:
-    """The step as messages of a chat."""
     if step.source == "user":
         yield {"role": "user", "content": step.text}
     elif step.source == "agent":

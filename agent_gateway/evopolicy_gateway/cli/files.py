@@ -33,8 +33,6 @@ DIALECT = "https://json-schema.org/draft/2020-12/schema"
 
 
 class Kind(NamedTuple):
-    """A kind of file."""
-
     type: type[msgspec.Struct]
     version: str
     """Changes when files of this kind change incompatibly."""

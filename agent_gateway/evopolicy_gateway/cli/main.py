@@ -141,7 +141,6 @@ def evopolicy(_: Version = False) -> None:
 
 
 def main() -> None:
-    """The program."""
     processes.become_subreaper()
     command = next((word for word in sys.argv[1:] if not word.startswith("-")), "")
     run_app(app, _EXTRAS.get(command))

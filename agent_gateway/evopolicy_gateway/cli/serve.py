@@ -164,7 +164,6 @@ def progress_of(machine: TicketMachine) -> Progress:
 
 
 def main() -> None:
-    """The program."""
     run_app(app)
 
 

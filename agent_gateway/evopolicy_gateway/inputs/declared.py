@@ -48,8 +48,6 @@ class McpServer(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
 
 
 class File(NamedTuple):
-    """A regular file."""
-
     data: bytes
     executable: bool
 

@@ -70,8 +70,6 @@ class Cluster(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Reached(NamedTuple):
-    """A reachable cluster."""
-
     operations: Operations
     gateway: Credentials
     """Credentials of the gateway role."""

@@ -51,8 +51,6 @@ def evaluation(
 
 
 class TriedEpisode(msgspec.Struct, frozen=True, kw_only=True):
-    """One episode of a trial."""
-
     case: int
     episode_return: float | None
     """None when nothing was played, because the first case showed that the code yields no Policy."""
@@ -73,8 +71,6 @@ class TriedEpisode(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class TrialResult(msgspec.Struct, frozen=True, kw_only=True):
-    """The result of a trial."""
-
     env: str
     mean_return: float | None
     """Mean over the cases in which the policy did not fail; None when there are none."""

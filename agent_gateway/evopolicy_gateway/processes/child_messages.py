@@ -85,8 +85,6 @@ class Progress(Event, frozen=True, kw_only=True, tag="progress"):
 
 
 class AgentTurn(Event, frozen=True, kw_only=True, tag="turn"):
-    """The agent has sent a message."""
-
     turn: int
     text: str
 

@@ -102,8 +102,6 @@ SHAPES: dict[str, Shape] = {
 
 
 class AnswerReader:
-    """Reads one answer as it comes."""
-
     def __init__(self, shape: Shape, *, events: bool, drops_usage: bool = False) -> None:
         """`events`: a stream of events, else one JSON document. `drops_usage`: an event with nothing but counts, which
         the agent did not ask for, is left out of what passes on."""

@@ -37,8 +37,6 @@ _PASSED_QUERY = ("alt", "beta", "client_version", "limit", "pageSize", "pageToke
 
 
 class Route(NamedTuple):
-    """One path of an API."""
-
     path: str
     """At the provider, below the base URL."""
     name: str

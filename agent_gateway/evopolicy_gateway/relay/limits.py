@@ -107,7 +107,6 @@ class Used(msgspec.Struct, kw_only=True):
     wait_s: float = 0.0
 
     def take(self, request: Request, declared: str | None = None) -> None:
-        """Adds a request."""
         self.requests += 1
         self.usage += request.usage
         self.failed += not 200 <= request.status < 300 or request.broken

@@ -36,8 +36,6 @@ _HERE = ("localhost", "127.0.0.1", "::1")
 
 
 class Sent(NamedTuple):
-    """A request to the provider."""
-
     name: str
     """`apis.Route.name`."""
     method: str

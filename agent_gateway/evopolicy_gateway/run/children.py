@@ -31,8 +31,6 @@ from evopolicy_gateway.workspace import staging as workspace
 
 
 class OpenRun(msgspec.Struct, frozen=True, kw_only=True):
-    """One open run."""
-
     plan: Plan
     run: str
     """Its id at the cluster."""
@@ -81,8 +79,6 @@ class Kept:
 
 
 class GatewayProcess(Kept):
-    """The gateway of one run."""
-
     def __init__(self, run: OpenRun, on_progress: Callable[[Progress], Awaitable[None]]) -> None:
         super().__init__(run)
         self._on_progress = on_progress
@@ -117,7 +113,6 @@ class GatewayProcess(Kept):
             await asyncio.sleep(0.1 * 2**quick_deaths)
 
     async def close(self, order: messages.CloseRun) -> None:
-        """Has the run closed, by this gateway or the next one."""
         self._close = order
         await self.tell(order)
 

@@ -41,8 +41,6 @@ from evopolicy_gateway.workspace.prompts import Prompts, read_prompts, read_text
 
 
 class Texts(msgspec.Struct, frozen=True, kw_only=True):
-    """The texts of one run."""
-
     agents_md: str = ""
     """In place of `AGENTS.md`; empty: the standard text."""
     prompts: Prompts = Prompts()
@@ -160,7 +158,6 @@ class Plan(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def entry(self) -> str:
-        """Leaderboard entry."""
         return self.settings.entry
 
     @property
@@ -331,8 +328,6 @@ def _unusual(values: dict[str, Any], usual: dict[str, Any]) -> dict[str, Any]:
 
 
 class StartPoint(NamedTuple):
-    """A start, and where its files are."""
-
     start: Start
     folder: RunFolder
     """Of the earlier run."""

@@ -44,8 +44,6 @@ class Place:
 
 
 class RunFolder(msgspec.Struct, frozen=True):
-    """Paths of one run."""
-
     root: Path
 
     workspace = Place("workspace")

@@ -262,7 +262,6 @@ class TicketMachine:
         return None
 
     def failed(self, error: Exception) -> Effect:
-        """An effect failed unexpectedly."""
         if self._failure is not None:
             return error
         self._failure = error

@@ -57,8 +57,6 @@ class Facts(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Decision(msgspec.Struct, frozen=True, kw_only=True):
-    """The decision for one run."""
-
     run: Plan
     kind: Kind
     attempt: int
@@ -68,7 +66,6 @@ class Decision(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def decide(run: Plan, facts: Facts, changed: Changed = "refuse") -> Decision:
-    """Returns the decision for a run."""
     entry = facts.entry
     before = 1 if entry is None else entry.attempt
     exists = facts.status is not None or facts.opened or (entry is not None and entry.state != "pending")

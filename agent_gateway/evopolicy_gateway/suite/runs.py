@@ -30,8 +30,6 @@ if TYPE_CHECKING:
 
 
 class PlayedRuns(msgspec.Struct, frozen=True):
-    """The results of the runs."""
-
     plans: Sequence[Plan]
     index: Index
     """Of this command alone; not saved."""

@@ -94,8 +94,6 @@ class Caps(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
 
 
 class SuiteFile(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """The whole file."""
-
     name: str
     """Names the sweep on the cluster and in the run directories."""
     environments: tuple[str, ...]

@@ -62,7 +62,6 @@ def directory_of(run: Plan) -> str:
 
 
 def entry_of(plan: Plan, record: RunRecord, **more: Any) -> Entry:
-    """The index entry of a finished run."""
     outcome, state, tokens = record.outcome, state_of(record), record.agent.tokens
     use = record.agent.model_use
     requests = {"requests": 0 if use is None else use.requests or 0}

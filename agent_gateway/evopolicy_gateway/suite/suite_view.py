@@ -172,7 +172,6 @@ class JsonView(SuiteView):
 
 
 def results_table(entries: list[Entry]) -> Table:
-    """A table of the runs' results."""
     headings = ("run", "state", "score", "random", "budget used", "tokens")
     made = table(*headings, right=("score", "random", "tokens"))
     for entry in entries:

@@ -330,7 +330,6 @@ def _feedback_files(run: RunOpened) -> str:
 
 
 def _ranges(n_episodes: int, n_ids: int) -> str:
-    """`n_episodes` ids as a text of ranges."""
     whole, rest = divmod(n_episodes, n_ids)
     lengths = [n_ids] * whole + [rest] * (rest > 0)
     return ",".join("0" if length == 1 else f"0-{length - 1}" for length in lengths)

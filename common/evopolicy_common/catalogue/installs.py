@@ -71,7 +71,6 @@ class Made(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def python(self) -> str:
-        """Its interpreter."""
         return str(Path(self.folder, "bin", "python"))
 
 

@@ -31,5 +31,4 @@ def unchanged(env_id: str) -> str:
 
 
 def ids(env_id: str) -> tuple[str, ...]:
-    """The worlds of an environment."""
     return tuple(f"{env_id}@w{n}" for n in range(1, N_WORLDS + 1))

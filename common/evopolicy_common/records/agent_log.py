@@ -17,8 +17,6 @@ _NOTES = ("turn_failed", "paused", "permission", "log_full", "result", "error")
 
 
 class Part(msgspec.Struct, frozen=True, kw_only=True):
-    """One part of a line."""
-
     kind: Literal["prompt", "text", "thinking", "call", "result", "stdout", "stderr", "note"]
     value: Any
     """A text, a call's arguments, a result's content, or a note's fields, as the line has them."""
@@ -34,17 +32,16 @@ class Part(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def parts(line: dict[str, Any]) -> Iterator[Part]:
-    """The parts of a line in order."""
     match line:
         case {"type": "prompt"}:
             yield Part(kind="prompt", value=line.get("message"), by_agent=False)
-        case {"type": "assistant" | "user" as role, "message": {**message}}:
+        case {"type": "assistant" | "user" as role, "message": dict(message)}:
             content = message.get("content")
             blocks = content if isinstance(content, list) else [{"type": "text", "text": content}]
             for block in blocks:
                 if isinstance(block, dict):
                     yield from _block(block, role == "assistant", _name(message.get("id")))
-        case {"type": "item.completed", "item": {**item}}:
+        case {"type": "item.completed", "item": dict(item)}:
             yield from _item(item)
         case {"type": "stdout" | "stderr" as kind, "text": str(text)}:
             yield Part(kind=kind, value=text)

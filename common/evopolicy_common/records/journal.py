@@ -103,8 +103,6 @@ class Opening(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class SubmitResult(msgspec.Struct, frozen=True, kw_only=True):
-    """The result of one accepted submit."""
-
     submit_index: Int
     status: SubmitStatus
     bundle: Word | None
@@ -226,7 +224,6 @@ def head_after(head: str, entry: bytes) -> str:
 
 
 def heads(entries: Iterable[bytes]) -> list[str]:
-    """The head after each entry."""
     return list(itertools.accumulate(entries, head_after, initial=EMPTY_HEAD))[1:]
 
 
@@ -236,8 +233,6 @@ def epoch_of(secret: bytes) -> str:
 
 
 class Epoch(msgspec.Struct, frozen=True, kw_only=True):
-    """An epoch, as a journal describes it."""
-
     epoch: str
     opened: int
     """Number of runs opened on its cases."""

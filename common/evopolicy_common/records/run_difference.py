@@ -87,7 +87,6 @@ def shortened(differing: Sequence[str], left: Path, right: Path) -> list[str]:
 
 
 def _files(root: Path) -> dict[str, Path]:
-    """The compared files by their path in the run."""
     paths = {str(path.relative_to(root)): path for path, _ in left_files(root)}
     for pattern in EXCLUDED_FILES:
         paths = {name: path for name, path in paths.items() if not fnmatch.fnmatchcase(name, pattern)}

@@ -61,8 +61,6 @@ class Tokens(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
 
 
 class ModelLimits(msgspec.Struct, frozen=True, kw_only=True):
-    """Limits of a run's use of its model."""
-
     max_requests: int
     max_tokens: int
     """All kinds together."""

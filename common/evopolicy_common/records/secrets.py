@@ -158,7 +158,6 @@ class Redaction:
         return re.compile(b"|".join(spelt))
 
     def text(self, text: str) -> str:
-        """Returns the text without secrets."""
         return self(text.encode("utf-8", "backslashreplace")).decode("utf-8", "replace")
 
 

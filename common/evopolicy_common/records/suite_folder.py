@@ -21,8 +21,6 @@ FINISHED: frozenset[str] = frozenset({"completed", "no_ok_submit"})
 
 
 class Entry(msgspec.Struct, frozen=True, kw_only=True):
-    """One run."""
-
     name: str
     agent: str
     env: str
@@ -53,8 +51,6 @@ class Entry(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Index(msgspec.Struct, kw_only=True):
-    """The whole file."""
-
     schema_version: int = SCHEMA_VERSION
     suite: str
     updated_at: str = ""

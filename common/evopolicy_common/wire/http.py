@@ -90,8 +90,6 @@ class _Server(uvicorn.Server):
 
 
 class TimedProtocol(H11Protocol):
-    """One connection."""
-
     _made_at = 0.0
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]

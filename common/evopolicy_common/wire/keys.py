@@ -32,10 +32,8 @@ def gateway_key(cluster: str, run: str, verb: str) -> str:
 
 
 def operator_key(cluster: str, verb: str) -> str:
-    """Key of operators' requests."""
     return f"{_ROOT}/{cluster}/ops/{verb}"
 
 
 def requests(cluster: str) -> dict[Role, str]:
-    """By role, the expression of all keys of its requests."""
     return {role: f"{_ROOT}/{cluster}/{place}/**" for role, place in _PLACES.items()}

@@ -142,7 +142,6 @@ class Requester(Generic[Reply]):
 
 
 def operator_requests(link: Link) -> Requester[OperatorReply]:
-    """A requester for an operator's requests to the cluster of `link`."""
     return Requester(link, partial(keys.operator_key, link.credentials.cluster), codec.operator_replies)
 
 

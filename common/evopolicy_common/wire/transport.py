@@ -293,7 +293,6 @@ async def _take_renewed(link: Link, read_again: Callable[[], Credentials]) -> No
 
 
 def _content(credentials: Credentials) -> tuple[object, ...]:
-    """Credentials with the content of their files."""
     tls = credentials.tls
     paths = () if tls is None else (tls.root_ca, tls.certificate, tls.private_key)
     return credentials, *(Path(path).read_bytes() for path in paths)

@@ -170,7 +170,6 @@ def repin(
 
 
 def render(reply: StatusReply) -> RenderableType:
-    """The status as tables."""
     slots = sum(worker.slots for worker in reply.workers if worker.state == "active")
     head = (
         f"cluster {reply.cluster} · evopolicy {reply.version} · up {duration(reply.uptime_s)} on {served_by(reply)} ·"

@@ -42,8 +42,6 @@ BESIDE: dict[MachineRole, tuple[Role, ...]] = {"operator": ("gateway",)}
 
 
 class Machine(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """One role of one machine."""
-
     role: MachineRole
     name: str
     password: str

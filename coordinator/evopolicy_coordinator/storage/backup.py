@@ -32,8 +32,6 @@ KEPT_FILES = (*SHARED_FILES, "certs/coordinator.pem", "certs/coordinator-key.pem
 
 
 class Backup(msgspec.Struct, frozen=True, kw_only=True):
-    """A finished backup."""
-
     path: str
     blobs: int
     bytes: int

@@ -246,7 +246,6 @@ class Store:
         )
 
     def close(self) -> None:
-        """Closes the connection."""
         self._db.close()
 
 
@@ -306,7 +305,6 @@ class Reader:
             return tuple(rows(self._db, kind, f"{where} LIMIT {n}", args))
 
     def close(self) -> None:
-        """Closes the connection."""
         self._db.close()
 
 

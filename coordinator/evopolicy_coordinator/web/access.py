@@ -51,7 +51,6 @@ _HOST = re.compile(r"(?:\[(?P<six>[0-9A-Fa-f:.]+)\]|(?P<name>[A-Za-z0-9._-]+))(?
 
 
 def drawn_token() -> str:
-    """A new token."""
     return secrets.token_urlsafe(32)
 
 
@@ -89,7 +88,6 @@ class Access:
         self.cookie_value = hmac.new(token.encode(), b"evopolicy web cookie", hashlib.sha256).hexdigest()
 
     def admits_token(self, token: str) -> bool:
-        """Whether it is the token."""
         return hmac.compare_digest(token.encode(), self._token.encode())
 
     def admits(self, headers: Headers) -> bool:

@@ -60,8 +60,6 @@ def read_python_files(system_dir: Path) -> dict[str, bytes]:
 
 
 class Module(NamedTuple):
-    """One reachable module."""
-
     name: str
     path: str
     source: bytes

@@ -76,7 +76,6 @@ def write_beside(panel: Axes, x: float, y: float, text: str, points: int, size: 
 
 
 def handles_of(entries: Iterable[str], looks: Mapping[str, Look]) -> list[Line2D]:
-    """A legend's entries."""
     return [
         Line2D([], [], color=look.colour, marker=look.marker, linestyle=look.dash, label=entry)
         for entry in entries

@@ -28,8 +28,6 @@ MAX_SUBMITS = 200
 
 
 class SubmitRow(msgspec.Struct, frozen=True, kw_only=True):
-    """One submit as its row shows it."""
-
     submit: Submit
     summary: Any
     """Its summary, the published software's too; None without one."""

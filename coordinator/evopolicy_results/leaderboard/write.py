@@ -39,8 +39,6 @@ Tell = Callable[[str], None]
 
 
 class Link(NamedTuple):
-    """A cell with a link."""
-
     text: str
     href: str
 

@@ -55,8 +55,6 @@ _NEVER = {
 
 
 class Published(msgspec.Struct, frozen=True, kw_only=True):
-    """The published runs."""
-
     path: str
     bytes: int
     runs: int
@@ -118,8 +116,6 @@ class _Source(NamedTuple):
 
 
 class Publisher:
-    """One publication."""
-
     def __init__(
         self,
         link: Link,

@@ -95,8 +95,6 @@ class Countersignature(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Episode(msgspec.Struct, frozen=True, kw_only=True):
-    """The result of one episode."""
-
     index: Int
     """Position in its group's list."""
     episode_return: Number
@@ -126,8 +124,6 @@ class Group(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Removed(msgspec.Struct, frozen=True, kw_only=True):
-    """A removed part."""
-
     what: str
     """A field of a file, or a file."""
     why: str
@@ -162,7 +158,6 @@ def document(content: object) -> bytes:
 
 
 def journal_lines(entries: Iterable[bytes]) -> bytes:
-    """The journal as a file."""
     return b"".join(entry + b"\n" for entry in entries)
 
 

@@ -25,8 +25,6 @@ _KINDS = {
 
 
 class File(NamedTuple):
-    """The published file."""
-
     name: str
     sha256: str
     size: int
@@ -44,7 +42,6 @@ def files(card: Card, digests: Mapping[str, str], file: File | None = None) -> d
 
 
 def markdown(card: Card) -> str:
-    """`card.md`."""
     n_runs, envs = len(card.runs), {cell.env for cell in card.results}
     lines = [
         f"""# Evaluation card

@@ -54,8 +54,6 @@ State = Literal["ok", "failed", "open"]
 
 
 class Finding(msgspec.Struct, frozen=True, kw_only=True):
-    """One verdict."""
-
     kind: str
     state: State
     text: str
@@ -88,7 +86,6 @@ class PublishedRun(msgspec.Struct, frozen=True, kw_only=True):
     """The content of `run.json`."""
 
     def cases(self, split: Split) -> tuple[Any, ...]:
-        """The cases of a split."""
         cases: tuple[Any, ...] = getattr(self.opening, split)
         return cases
 
@@ -120,8 +117,6 @@ class PublishedRun(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Checked(msgspec.Struct, kw_only=True):
-    """The result of a check so far."""
-
     signer: str = ""
     """Public key, hexadecimal; empty without a valid signature."""
     findings: list[Finding] = []

@@ -79,7 +79,6 @@ def family_of(env: str) -> str:
 
 
 def family_title(family: str) -> str:
-    """Displayed title of a family."""
     return catalogue.families().get(family, family.replace("_", " ").capitalize())
 
 

@@ -36,8 +36,6 @@ class Source(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Submit(msgspec.Struct, frozen=True, kw_only=True):
-    """One accepted submit."""
-
     index: int
     status: str
     n_episodes: int

@@ -176,7 +176,6 @@ def score_table(runs: Iterable[Run]) -> ScoreTable:
 
 
 def returns_of(run: Run) -> RunReturns:
-    """The score and the returns of a run; none without a score."""
     shared = run.record.experiment_dimensions.hidden_cases == "shared"
     return RunReturns(
         score=run.score,
@@ -365,7 +364,6 @@ class Scale(msgspec.Struct, frozen=True, kw_only=True):
     best: float
 
     def clipped(self, score: float) -> float:
-        """The score on this scale, in [0, 1]."""
         return min(1.0, max(0.0, (score - self.random) / (self.best - self.random)))
 
 

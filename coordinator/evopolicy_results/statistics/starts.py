@@ -45,7 +45,6 @@ def by_state(runs: Iterable[Run]) -> dict[tuple[str, int, str], list[Run]]:
 
 
 def start_groups(runs: Sequence[Run], *, resamples: int = RESAMPLES) -> list[StartGroup]:
-    """The groups of the started runs among `runs`."""
     names = {run.record.run: f"{run.entry} / {run.record.exp_id}" for run in runs if run.record.run}
     out = []
     for (parent, _, _), group in by_state(runs).items():

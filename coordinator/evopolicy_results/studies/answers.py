@@ -42,7 +42,6 @@ class Answers(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def answers_of(study: Study) -> Answers:
-    """The answers about a study."""
     cells = [cell for suite in study.suites for cell in suite.table.cells.values() if cell.fixed is None]
     n_envs = len({cell.env for cell in cells})
     n_started = sum(run.record.start is not None for run in study.runs)

@@ -75,7 +75,6 @@ class Table(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def rows_of(records: Iterable[Any], columns: Sequence[Column]) -> list[dict[str, Any]]:
-    """A row a record."""
     return [{column.key: column.value(each) for column in columns} for each in records]
 
 
@@ -139,7 +138,6 @@ _SENTENCE = re.compile(r"\S.*?[.:](?=\s|$)")
 def with_interval(
     key: str, title: str, of: Callable[[Any], Estimate | Bounded], digits: int
 ) -> tuple[Column, Column]:
-    """Columns of an estimate's value and of its interval."""
     return (
         Column(key, title, "number", digits=digits, of=lambda each: of(each).value, spread=of),
         Column(f"{key}_interval", INTERVAL, of=lambda each: interval_text(of(each))),

@@ -288,7 +288,6 @@ class Verifier:
 def _differences(
     played: EpisodeList, index: int, recording: _Recording, again: EpisodeOutcome, replayed: Trajectory
 ) -> Iterator[str]:
-    """All in which an episode that was played again differs from its records."""
     then, summary = recording.outcome, played.submit.summary if played.submit else None
     stored = None if recording.stored is None else decode(recording.stored)
     if stored and then and (fault := compare.episode_difference(then, stored, again, replayed)):

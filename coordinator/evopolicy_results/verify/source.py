@@ -37,7 +37,6 @@ class EpisodeList(Cases, frozen=True, kw_only=True):
     """Whether the folders have the observations that are stored outside the rows."""
 
     def name(self, index: int) -> str:
-        """An episode's name in reports."""
         if self.folders:
             return f"submit {self.submit_index}, {self.folders[index].name}"
         policy = "random actions" if self.submit_index == RANDOM else f"submit {self.submit_index}"

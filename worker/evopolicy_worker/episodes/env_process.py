@@ -187,7 +187,6 @@ class EnvProcess:
 
 
 def main() -> None:
-    """The process's entry."""
     commands, replies = messages.take_pipes()
     channel = Channel(commands, replies)
     while not (received := channel.receive()):

@@ -161,7 +161,6 @@ class Policies:
                 policy.end()
 
     def _start(self) -> PolicyProcess:
-        """The process of the next policy."""
         child, self._prepared = self._prepared or self._spawn(), None
         self._n_policies += 1
         folder = self._scratch / "policies" / str(self._n_policies)

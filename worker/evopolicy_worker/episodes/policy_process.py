@@ -344,7 +344,6 @@ class PolicyProcess:
     # How it failed.
 
     def _reported_failure(self, tag: int, payload: bytes, asked: str) -> PolicyFailedError:
-        """The failure that the policy's process reports of itself."""
         if asked == "seal":
             # None of the bundle's code has run: this is ours.
             self._bury()

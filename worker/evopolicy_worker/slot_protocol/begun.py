@@ -59,7 +59,6 @@ class Begun:
             self.log.add(each.action)
 
     def fail(self, failure: PolicyFailure) -> None:
-        """The policy has failed."""
         self.failure = failure
         if self.log is not None:
             self.log.write(self)

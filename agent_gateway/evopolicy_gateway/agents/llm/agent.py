@@ -54,7 +54,6 @@ class Events:
         self._emit({"type": "assistant", "message": message})
 
     def output(self, call: Call, text: str, *, succeeded: bool) -> None:
-        """A command's output."""
         block = {"type": "tool_result", "tool_use_id": call.id, "content": text, "is_error": not succeeded}
         self._emit({"type": "user", "message": {"role": "user", "content": [block]}})
 

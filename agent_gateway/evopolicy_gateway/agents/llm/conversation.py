@@ -122,8 +122,6 @@ class _AsSent(ToolCallPart):  # type: ignore[misc]
 
 
 class Conversation:
-    """One conversation."""
-
     def __init__(self, settings: dict[str, Any], key: str, kept: bytes = b"") -> None:
         """`settings`: made by `harnesses/coding_agents/llm.py`. `kept`: an earlier conversation, from `dumped`."""
         self.context_tokens = int(settings["context_tokens"])
@@ -140,7 +138,6 @@ class Conversation:
         self._system = (settings["system"] or SYSTEM) + _skills(settings.get("skills", ()))
 
     def dumped(self) -> bytes:
-        """The conversation as JSON."""
         messages = ModelMessagesTypeAdapter.dump_python(self.messages, mode="json")
         return json.dumps({"streams": self._streams, "messages": messages}).encode()
 

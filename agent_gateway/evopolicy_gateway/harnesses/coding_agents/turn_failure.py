@@ -71,8 +71,6 @@ _UNITS = {"ms": 0.001, "s": 1.0, "m": 60.0, "h": 3600.0, "d": 86400.0}
 
 
 class TurnFailure(msgspec.Struct, frozen=True, kw_only=True):
-    """A failed turn."""
-
     kind: Kind
     message: str
     provider: bool = False

@@ -128,7 +128,6 @@ class ApiTable(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
 
     @property
     def spoken(self) -> ApiName:
-        """The API of the built-in agent."""
         return self.api or (PROVIDERS[self.provider].api if self.provider else "chat")
 
     @property
@@ -160,8 +159,6 @@ class ApiTable(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
 
 
 class Provider(NamedTuple):
-    """A provider of models."""
-
     base_url: str
     variable: str
     """Usual name of the variable with the key."""
@@ -206,8 +203,6 @@ def relay_variables(protocol: Protocol, url: str, token: str) -> dict[str, str]:
 
 
 class AgentConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """All of an agent's settings."""
-
     harness: str
     """`codex`, `claude-code`, `llm` with an `[api]` table, or any other name with an `[acp]` or `[cli]` table."""
     model: str | None = None

@@ -105,7 +105,6 @@ class Column:
         return self.data[t] if self.kind == "values" else self._each(lambda part: part.row(t))
 
     def rows(self) -> list[Any]:
-        """All rows, one by one."""
         return [self.row(t) for t in range(self.n)]
 
     def values(self) -> Any:

@@ -78,8 +78,6 @@ class File(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Header(msgspec.Struct, frozen=True, kw_only=True):
-    """The container's header."""
-
     observations: ObservationForm
     n: int
     """Number of steps."""

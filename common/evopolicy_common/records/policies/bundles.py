@@ -39,8 +39,6 @@ COMPILED = ".pyc"
 
 
 class BundleFile(msgspec.Struct, frozen=True, array_like=True):
-    """One file of a bundle."""
-
     path: str
     """Relative to `system/`, with forward slashes."""
     executable: bool

@@ -99,7 +99,6 @@ def write(folder: Path, meta: CheckpointMeta, bundle: Bundle | None, metrics: Co
 
 
 def without_metadata(files: tuple[BundleFile, ...]) -> Bundle:
-    """The bundle of the files without a metadata file's name."""
     return bundles.pack([file for file in files if file.path not in METADATA])
 
 

@@ -68,7 +68,6 @@ class SubmitFiles:
 
     @property
     def n_episodes(self) -> int:
-        """Episodes charged."""
         if self.summary is not None:
             return self.summary.n_episodes
         return 0 if self.meta is None else self.meta.n_episodes_requested

@@ -52,8 +52,6 @@ _SUBMIT = re.compile(r"submit_[0-9]{1,9}")
 
 
 class TreeFile(msgspec.Struct, frozen=True, array_like=True):
-    """One file of a tree."""
-
     path: str
     """Relative to the workspace, with forward slashes."""
     blob: str

@@ -36,7 +36,6 @@ def place(run: Run, boot_id: str) -> str | None:
 
 
 def held(state: State, run: str) -> list[tuple[Kernel, PermitRow]]:
-    """A run's permits."""
     return [(kernel, row) for kernel, (row, _) in state.permits.get(run, {}).items()]
 
 
@@ -78,7 +77,6 @@ def _grant(state: State, run: str, kernel: Kernel, case_set: CaseSet, step: Step
 
 
 def restore(state: State, row: PermitRow, case_set: CaseSet) -> None:
-    """Enter a permit."""
     case_set.users += 1
     kernel = conflicts.kernel(state, row.boot_id)
     put(kernel.permits, case_set, row.run, row)
@@ -188,5 +186,4 @@ def agents(state: State, run: str) -> str:
 
 
 def poll_target(run: str, boot_id: str) -> str:
-    """Target of the polls that wait for a permit."""
     return f"permit {run} {boot_id}"

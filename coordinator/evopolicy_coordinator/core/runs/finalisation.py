@@ -51,7 +51,6 @@ def _open(state: State, group: JobGroup, step: Step) -> None:
 
 
 def progressed(state: State, news: EpisodesDone, step: Step) -> None:
-    """Some hidden episodes are done."""
     group = news.group
     if group.done < group.n:
         return

@@ -130,7 +130,6 @@ def result(
 
 
 def waited(state: State, event: events.Requested[operator.WaitRun], step: Step) -> None:
-    """An operator waits for the end of a run."""
     message = event.message
     run = requests.known(state, message.run)
     if run is None:

@@ -54,7 +54,6 @@ def answer_polls(state: State, group: JobGroup, step: Step) -> None:
 
 
 def answer(state: State, poll: Poll, step: Step) -> None:
-    """Answer a poll with the present results."""
     run = state.runs[poll.target.split("/")[0]]
     index = int(poll.target.split("/")[1][1:])
     row = run.submits[index]

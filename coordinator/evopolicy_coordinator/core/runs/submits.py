@@ -108,7 +108,6 @@ def play(state: State, run: Run, row: SubmitRow, step: Step) -> None:
 
 
 def progressed(state: State, news: EpisodesDone, step: Step) -> None:
-    """Some episodes of an open submit are done."""
     group = news.group
     run = state.runs[group.run]
     for outcome in news.outcomes:

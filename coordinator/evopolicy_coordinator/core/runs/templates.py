@@ -38,7 +38,6 @@ HIDDEN_SPLITS = ("validation", "heldout")
 
 
 def train(run: Run, row: SubmitRow, step: Step) -> JobGroup:
-    """The episodes of a submit."""
     return _group(
         "train",
         run,

@@ -92,7 +92,6 @@ HIDDEN_FIRST = ((HIDDEN,), (TRAIN,), (REFERENCE,))
 
 
 def by_priority(make: Callable[[], Any]) -> list[Any]:
-    """A value for each priority."""
     return [make() for _ in range(N_PRIORITIES)]
 
 
@@ -638,8 +637,6 @@ RETRIES_KEPT = 16
 
 @dataclass(slots=True, eq=False)
 class Run:
-    """An unfinished run."""
-
     row: RunRow
     state: RunStateRow
     ledger: Ledger
@@ -666,14 +663,11 @@ class Run:
 
     @property
     def case_set(self) -> CaseSet:
-        """The case set of its hidden cases."""
         assert self.flow.case_set is not None
         return self.flow.case_set
 
 
 @dataclass(slots=True, eq=False)
 class Evaluation:
-    """An unfinished evaluation."""
-
     row: EvaluationRow
     flow: Flow

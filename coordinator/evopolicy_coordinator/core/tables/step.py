@@ -166,7 +166,6 @@ class Step:
         self._out.append(Refuse(request=request, reason=reason))
 
     def log(self, level: Literal["debug", "info", "warning", "error"], event: str, **fields: Any) -> None:
-        """Log for operators."""
         self._out.append(Log(level=level, event=event, fields=fields, stimulus_id=self.stimulus_id))
 
     def effects(self) -> list[Effect]:

@@ -93,7 +93,6 @@ class Meter:
                 self._events.labels(effect.event, effect.level).inc()
 
     def text(self) -> bytes:
-        """All metrics in the text format."""
         return generate_latest(self.registry)
 
     def _outcome(self, row: OutcomeRow) -> None:

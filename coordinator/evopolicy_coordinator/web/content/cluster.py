@@ -108,7 +108,6 @@ class Cluster:
                 await set_within(self._wake, _IDLE_S - self._pause_s)
 
     def take(self, status: StatusReply) -> None:
-        """A new status."""
         self.status, self._at, self.trouble = status, time.monotonic(), ""
         for run in status.runs:
             if run.retries:

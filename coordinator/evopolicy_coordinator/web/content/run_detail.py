@@ -80,8 +80,6 @@ class Message(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Happened(msgspec.Struct, frozen=True, kw_only=True):
-    """One event of the run."""
-
     at: str
     level: str
     text: str

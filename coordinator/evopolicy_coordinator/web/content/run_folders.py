@@ -42,8 +42,6 @@ _BY_EPISODE = ("env_instances", "returns", "episode_lengths", "reward_components
 
 
 class Submit(NamedTuple):
-    """One submit of a run."""
-
     summary: Summary
     """Without its fields by episode, which are read again for its page: a run has thousands of episodes."""
     consumed: int
@@ -131,8 +129,6 @@ class Sweep(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Runs(msgspec.Struct, frozen=True, kw_only=True):
-    """All runs at one time."""
-
     sweeps: tuple[Sweep, ...] = ()
     by_key: Mapping[str, RunFacts] = {}
     shut: frozenset[str] | None = frozenset()
@@ -214,7 +210,6 @@ class Reader:
         return Runs(sweeps=tuple(sweeps), by_key=by_key, shut=shut, origins=frozenset(origins - {""}))
 
     def run(self, folder: Path, entry: Entry | None, by_run: Mapping[str, RunStatus]) -> RunFacts:
-        """One run with a folder."""
         try:
             info = (folder / RUN_JSON).stat()
         except OSError:

@@ -220,7 +220,6 @@ def _texts(files: Iterable[CodeFile]) -> dict[str, str]:
 
 
 def file_link(run: RunFacts, path: str) -> str:
-    """The address of a file of a run."""
     return f"/run/{run.key}/file?{urlencode({'path': path})}"
 
 

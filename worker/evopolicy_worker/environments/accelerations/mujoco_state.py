@@ -39,7 +39,6 @@ class _Direct(MujocoEnv):
         mj_step(self.model, self.data, n_frames)
 
     def position(self, body: str) -> Any:
-        """A view of the body's position."""
         return self.data.xpos[self.model.body(body).id]
 
 

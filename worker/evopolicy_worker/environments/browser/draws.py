@@ -89,7 +89,6 @@ def _call(name: str, seen: _Seen, rng: Rng) -> str:
 
 
 def _place(boxes: Sequence[Box], size: tuple[int, ...], rng: Rng) -> tuple[float, float]:
-    """A place: anywhere, or in one of the boxes."""
     anywhere = [(0.0, 0.0, float(size[0]), float(size[1]))]
     left, top, width, height = _one(_one((boxes or anywhere, anywhere), rng), rng)
     return left + width * rng.random(), top + height * rng.random()

@@ -51,8 +51,6 @@ _POINTED = {
 
 
 class MiniWoBEnv(PageEnv):
-    """A page of MiniWoB++."""
-
     def __init__(self, page: str, **options: Any) -> None:
         """`options`: those of `PageEnv`."""
         super().__init__(page, **{"reward": "decayed", **options})
@@ -149,7 +147,6 @@ _ELEMENT: Mapping[str, type[np.generic] | None] = {
 
 
 def _element(row: list[Any]) -> dict[str, Any]:
-    """An element as the space has it."""
     return {
         name: part if dtype is None else np.array(part if isinstance(part, list) else (part,), dtype)
         for (name, dtype), part in zip(_ELEMENT.items(), row, strict=True)

@@ -420,12 +420,10 @@ def _first(address: Address) -> list[tuple[str, dict[str, Any]]]:
 
 
 def _script(seed: str, *, virtual: bool) -> str:
-    """`page.js` for one page."""
     text = files(__package__).joinpath("page.js").read_text("utf-8")
     return text.replace("SEED)", f"{json.dumps(seed)})").replace("VIRTUAL)", f"{json.dumps(virtual)})")
 
 
 @cache
 def shared() -> Page:
-    """This process's page."""
     return Page()

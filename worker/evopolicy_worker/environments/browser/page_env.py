@@ -122,7 +122,6 @@ class PageEnv(gymnasium.Env[Any, Any]):
         return outcome
 
     def render(self) -> Any:
-        """The window as it is."""
         return self.picture(*self._size[:2])
 
     def picture(self, width: int, height: int) -> Frame:
@@ -192,5 +191,4 @@ class PageEnv(gymnasium.Env[Any, Any]):
 
 
 def script(name: str) -> str:
-    """A script of this package."""
     return files(__package__).joinpath(name).read_text("utf-8")

@@ -146,7 +146,6 @@ def _set_birthday(library: str) -> None:
 
 
 def _choice(action: Any, common: Mapping[str, Any]) -> str:
-    """The effect of an action."""
     kind, name = type(action).__name__, action.name
     if kind.startswith("Compass"):
         way = common["direction"][name]

@@ -284,7 +284,6 @@ class _Sequence(ActionCodec):
         return self.drawn(rng, min(int(rng.geometric(0.25)), MAX_ITEMS))
 
     def drawn(self, rng: np.random.Generator, n: int) -> Any:
-        """`n` random items."""
         return self._made([self.item.sample(rng) for _ in range(n)])
 
     def _made(self, items: list[Any]) -> Any:

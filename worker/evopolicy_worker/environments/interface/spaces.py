@@ -131,7 +131,6 @@ Checker = Callable[[Any], str]
 
 
 def compile_checker(schema: SpaceSchema) -> Checker:
-    """The checker of a space."""
     kind = schema["type"]
     if kind in ("Dict", "Tuple"):
         keys = schema["spaces"] if kind == "Dict" else range(len(schema["spaces"]))
