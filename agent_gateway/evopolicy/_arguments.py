@@ -185,7 +185,6 @@ def _rule(one: Declared) -> Rule:
 
 
 OPTIONS = {one.name: one for one in declared(run_options.RunOptions).values() if one.option.python}
-"""The options of a run that Python has."""
 _HELPS = (f"`{one.name}`: {one.help}" for one in OPTIONS.values() if one.name != "agent")
 RunOptions.__doc__ = "\n".join([f"{RunOptions.__doc__}\n", *_HELPS])
 RULES: dict[str, Rule] = {

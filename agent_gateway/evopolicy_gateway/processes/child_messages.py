@@ -155,7 +155,6 @@ class StartAgent(Order, frozen=True, kw_only=True, tag="start_agent"):
     agent: str
     """In the form of `--agent`."""
     folder: str
-    """The run's folder."""
     urls: dict[str, str]
     """The `EVOPOLICYGYM_*` variables that hold URLs; the jail lets these URLs through."""
     variables: dict[str, str] = {}

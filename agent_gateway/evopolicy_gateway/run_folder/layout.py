@@ -49,7 +49,6 @@ class RunFolder(msgspec.Struct, frozen=True):
     workspace = Place("workspace")
     """The agent's working directory."""
     agents_md = Place("workspace/AGENTS.md")
-    """The rules for the agent."""
     system = Place("workspace/system")
     """The policy that the agent edits."""
     feedback = Place("workspace/feedback")

@@ -36,7 +36,6 @@ class Install(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     """How a family is installed."""
 
     extra: str
-    """Extra of this software."""
     modules: tuple[str, ...]
     """Modules without which its environments cannot be played."""
     megabytes: int

@@ -80,9 +80,7 @@ LARGEST_LIMITS: dict[str, int] = {
     "action_bytes": 1 << 20,
     "episode_action_bytes": 64 << 20,
 }
-"""Maxima of these limits."""
 LARGEST_LIMIT = 1 << 53
-"""The maximum of every other limit."""
 
 
 class BlobRef(msgspec.Struct, frozen=True, kw_only=True):

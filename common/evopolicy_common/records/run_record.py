@@ -61,6 +61,8 @@ class Tokens(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
 
 
 class ModelLimits(msgspec.Struct, frozen=True, kw_only=True):
+    """Limits of a run's use of its model."""
+
     max_requests: int
     max_tokens: int
     """All kinds together."""

@@ -21,6 +21,8 @@ FINISHED: frozenset[str] = frozenset({"completed", "no_ok_submit"})
 
 
 class Entry(msgspec.Struct, frozen=True, kw_only=True):
+    """One run."""
+
     name: str
     agent: str
     env: str

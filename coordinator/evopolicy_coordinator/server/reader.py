@@ -74,7 +74,6 @@ class ServiceReader:
 
     def __init__(self, database: Place, blobs: BlobStore, uploads: Uploads, state: Path) -> None:
         self.state = state
-        """The state folder."""
         self.storage_error = ""
         """Why the last chunk of a blob could not be written; empty: it was."""
         self._database = database

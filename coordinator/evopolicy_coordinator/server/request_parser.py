@@ -235,7 +235,6 @@ REQUESTS: dict[type[Message], Request] = {
         check=lambda _, m: require(bool(m.reason.strip()), Refusal.BAD_MESSAGE, _NO_REASON)
     ),
 }
-"""All kinds of requests."""
 
 
 def _opens(message: Message) -> bool:

@@ -44,17 +44,6 @@ class Policy:
         return [GAIN * self.kp * self.last, -1.0]
 '''
 
-HEAD, _, TAIL = BASE.partition("class Policy:")
-MOVED = {
-    "policy.py": (
-        "import helpers\nfrom constants import GAIN\n\n\nclass Policy:"
-        + TAIL.replace("follow(obs", "helpers.follow(obs")
-    ),
-    "helpers.py": HEAD.replace("GAIN = 0.5\n", ""),
-    "constants.py": "GAIN = 0.5\n",
-}
-
-
 RICH = """import numpy as xp
 from dataclasses import dataclass, field
 
@@ -112,12 +101,6 @@ class Policy:
         return x if x else -1
 """
 """Most of the language: nested functions, classes that inherit, patterns, globals."""
-HELPER, _, REST = RICH.partition("LIMIT = [")
-
-
-def policy_with(imported: str) -> bytes:
-    """The rest of RICH, with the classes before it imported."""
-    return f"import numpy as xp\n{imported}\n\nLIMIT = [{REST}".encode()
 
 
 def swap(*texts: str, source: str = BASE) -> dict[str, bytes]:
@@ -145,68 +128,19 @@ BYTES_ONLY = {
     "blank lines and quotes": swap('obs["target"], obs["here"]', "\n    obs['target'],\n    obs['here'],\n"),
     "a docstring": swap("Follows the target.", "Follows the target with a filter."),
     "a docstring removed": swap('    """Follows the target."""\n', ""),
-    "a local variable renamed": swap("delta", "gap"),
-    "an attribute renamed": swap("kp", "proportional"),
-    "a function renamed": swap("wrap", "principal_angle"),
-    "a global renamed": swap("GAIN", "STRENGTH"),
-    "a parameter renamed": swap("here", "place", source=BASE.replace('["here"]', '["h"]')),
     "type hints": swap("def wrap(angle):", "def wrap(angle: float) -> float:"),
     "a hint on a variable": swap("        error = ", "        error: float = "),
-    "functions reordered": {
-        "policy.py": BASE.replace(
-            BASE[BASE.index("def wrap") : BASE.index("def follow")],
-            "",
-        )
-        .replace("class Policy:", BASE[BASE.index("def wrap") : BASE.index("def follow")] + "class Policy:")
-        .encode()
-    },
-    "methods reordered": {
-        "policy.py": (
-            BASE.replace("    def reset(self, episode_index):\n        self.last = 0.0\n\n", "")
-            + "\n    def reset(self, episode_index):\n        self.last = 0.0\n"
-        ).encode()
-    },
-    "code moved to helper modules": {name: text.encode() for name, text in MOVED.items()},
-    "digits of a format specification": swap(":.2f", ":.4f"),
-    "another import style": {
-        "policy.py": BASE.replace("import math\n", "from math import pi\n").replace("math.pi", "pi").encode()
-    },
     "an unused import": swap("import math\n", "import math\nimport random\n"),
 }
 
 PARAMETRIC = {
-    "a class renamed": rich("Planner", "Searcher"),
-    "a base class renamed": rich("Memory", "Store"),
-    "a method renamed": rich(".plan(", ".search(", "def plan", "def search"),
-    "an import's alias renamed": rich("numpy as xp", "numpy as np", "xp.", "np."),
-    "an import without its alias": rich("import numpy as xp", "import numpy", "xp.", "numpy."),
-    "a keyword parameter renamed with its calls": rich("depth", "levels"),
-    "a nested function renamed": rich("cost", "price"),
     "a nested default": rich("b=1.0", "b=1.5"),
-    "a comprehension's variable renamed": rich("cost(c, b=2.0) for c in", "cost(z, b=2.0) for z in"),
-    "a lambda's parameter renamed": rich("lambda cell: cost(cell)", "lambda q: cost(q)"),
-    "an exception's name": rich("error", "problem"),
     "a pattern's constant": rich("case 0", "case 5"),
-    "a pattern's capture renamed": rich("case n if n > 3", "case k if k > 3", "return n\n", "return k\n"),
-    "an assignment expression renamed": rich("step", "after"),
-    "a declared global renamed": rich("COUNT", "CALLS"),
     "the values of a list": rich("[1, 2, 3]", "[9, -8, 7.5]"),
     "the values of a class variable": rich("(0.1, 0.2, 0.3)", "(1, 2, 3)"),
     "a field's default": rich("size: int = 7", "size: int = 8"),
     "a number written otherwise": rich("0.1", "1e-1"),
-    "two attributes that trade names": rich(
-        "self.old", "self.tmp", "self.new", "self.old", "self.tmp", "self.new"
-    ),
     "a returned constant's sign": rich("else -1", "else 1"),
-    "classes moved to a module": {
-        "policy.py": policy_with("from brain import Planner"),
-        "brain.py": HELPER.encode(),
-    },
-    "classes moved to a package": {
-        "policy.py": policy_with("from lib.brain import Planner"),
-        "lib/__init__.py": b"",
-        "lib/brain.py": HELPER.encode(),
-    },
     "two statements on a line": rich("= depth\n        self.width", "= depth; self.width"),
     "needless parentheses": rich("abs(a - goal) * b", "(abs((a) - goal)) * (b)"),
     "line ends": rich("\n", "\r\n"),
@@ -218,6 +152,7 @@ PARAMETRIC = {
 }
 
 STRUCTURE = {
+    "a function renamed": swap("wrap", "principal_angle"),
     "a new branch": swap("        print(f", "        if error > 2:\n            error = 2\n        print(f"),
     "a loop": swap(
         "        print(f", "        for _ in range(3):\n            error *= 0.5\n        print(f"
@@ -269,8 +204,7 @@ SYNTHESIS = {
 
 @pytest.mark.parametrize("edit", [*BYTES_ONLY, *PARAMETRIC])
 def test_edit_that_is_no_structure_keeps_the_topology(edit: str) -> None:
-    before = BASE.replace('["here"]', '["h"]') if edit == "a parameter renamed" else BASE
-    before = before if edit in BYTES_ONLY else RICH
+    before = BASE if edit in BYTES_ONLY else RICH
     digest, topology, _ = describe_files({"policy.py": before.encode()})
     new_digest, new_topology, _ = describe_files((BYTES_ONLY | PARAMETRIC)[edit])
     assert new_digest != digest
@@ -306,20 +240,6 @@ def test_imports_are_followed_into_packages_and_functions() -> None:
         }
     )
     assert list(modules) == ["control", "control.base", "control.pid", "maps.grid", "plugin", "policy"]
-
-
-def test_swapping_a_file_between_equal_bodies_of_two_helpers_keeps_the_topology() -> None:
-    one = {
-        "policy.py": b"import a, b\nX = a.f(1) + b.g(2)\n",
-        "a.py": b"def f(x):\n    return x\n",
-        "b.py": b"def g(x):\n    return -x\n",
-    }
-    two = {
-        "policy.py": b"import a, b\nX = b.f(1) + a.g(2)\n",
-        "b.py": b"def f(x):\n    return x\n",
-        "a.py": b"def g(x):\n    return -x\n",
-    }
-    assert describe_files(one)[1] == describe_files(two)[1]
 
 
 def test_source_that_does_not_parse_is_opaque_and_no_crash() -> None:

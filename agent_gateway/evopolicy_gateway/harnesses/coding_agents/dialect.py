@@ -58,7 +58,6 @@ class Dialect(ABC):
     tested_version = ""
     """Version of the CLI with which the dialect was last tested."""
     install = ""
-    """The install command."""
     makes_session_id = False
     """Whether the first turn starts under an id that we generate."""
     resumes = True

@@ -203,6 +203,8 @@ def relay_variables(protocol: Protocol, url: str, token: str) -> dict[str, str]:
 
 
 class AgentConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """All of an agent's settings."""
+
     harness: str
     """`codex`, `claude-code`, `llm` with an `[api]` table, or any other name with an `[acp]` or `[cli]` table."""
     model: str | None = None

@@ -52,7 +52,6 @@ class CheckpointMeta(msgspec.Struct, frozen=True, kw_only=True):
     snapshot_files: Any = ()
     """Paths of the policy's files. Other software may have written this field and `import_scan`."""
     import_scan: Any = None
-    """An `ImportScan`."""
     validation_status: str
     """The status of the submit's summary."""
     bundle: str = ""

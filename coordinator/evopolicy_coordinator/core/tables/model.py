@@ -592,7 +592,6 @@ class Worker:
     cpu: str = ""
     """Its processor's features."""
     installation: str = ""
-    """Its Python installation."""
     missing_tiers: dict[str, str] = field(default_factory=dict)
     """Sandbox tiers that should work there and do not, with the reasons."""
     state: Literal["active", "paused", "draining", "lost"] = "active"

@@ -38,7 +38,6 @@ class Acceleration:
     """One replacement: a module of this package whose `accelerate(env)` changes that bare Gymnasium environment."""
 
     name: str
-    """The module's name."""
     gymnasium_ids: tuple[str, ...]
     distributions: tuple[str, ...]
     """Distributions whose installed versions must be in `PROVED`."""
