@@ -57,7 +57,7 @@ class JobRetried(NamedTuple):
     job: JobState
     worker: str
     failure: str
-    """As `leasing.retry.JobFailure`."""
+    """As `leasing.jobs.JobFailure`."""
 
 
 class EnvironmentFailed(NamedTuple):
