@@ -74,7 +74,6 @@ class Declared(NamedTuple):
 
 @functools.cache
 def declared(options: type[msgspec.Struct]) -> dict[str, Declared]:
-    """The options that a class declares, by name."""
     fields, plain, noted = {}, get_type_hints(options), get_type_hints(options, include_extras=True)
     helps = field_texts(options)
     for field in msgspec.structs.fields(options):

@@ -27,8 +27,6 @@ class NotThereError(Exception):
 
 
 class Name(NamedTuple):
-    """One entry of a folder."""
-
     name: str
     is_folder: bool
     size: int

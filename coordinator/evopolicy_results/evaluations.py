@@ -51,8 +51,6 @@ class Cases(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Evaluations:
-    """Evaluations on one cluster, one at a time."""
-
     def __init__(self, link: Link, tell: Tell, *, own: bool = False) -> None:
         """`own`: the command started this cluster. An environment that fails on its workers then raises
         BrokenEnvironmentError instead of being waited for."""

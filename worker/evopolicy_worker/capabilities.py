@@ -175,7 +175,6 @@ class Cache:
         self._folder = folder or cache / "evopolicy" / "descriptions"
 
     def get(self, env_id: str) -> EnvironmentDescription | None:
-        """The cached description, if it is still valid."""
         try:
             kept = msgspec.json.decode(self._path(env_id).read_bytes(), type=_Kept)
         except (OSError, *DECODE_ERRORS):

@@ -76,8 +76,6 @@ MAX_PREPARED = 4
 
 
 class Options(msgspec.Struct, frozen=True, kw_only=True):
-    """A worker's start options."""
-
     name: str
     slots: int
     fingerprint: Fingerprint

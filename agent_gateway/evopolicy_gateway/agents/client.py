@@ -50,8 +50,6 @@ class Verdict:
 
 @dataclass(kw_only=True)
 class Client:
-    """A client of one run's gateway."""
-
     info_url: str
     task_url: str
     submit_url: str

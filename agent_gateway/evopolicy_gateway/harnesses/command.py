@@ -128,8 +128,6 @@ class RemoteHarness(Harness):
 
 
 class _Talk:
-    """The turns of one program."""
-
     def __init__(self, process: AgentProcess, stage: Stage) -> None:
         self.turn = 0
         """Number of turns answered."""

@@ -35,8 +35,6 @@ class Event(msgspec.Struct, frozen=True, kw_only=True, tag_field="event"):
 
 
 class Ready(Event, frozen=True, kw_only=True, tag="ready"):
-    """The gateway serves."""
-
     variables: dict[str, str]
     """The `EVOPOLICYGYM_*` variables that hold URLs."""
     notes: tuple[str, ...] = ()

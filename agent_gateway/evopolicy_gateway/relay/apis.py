@@ -50,8 +50,6 @@ class Route(NamedTuple):
 
 
 class Upstream(msgspec.Struct, frozen=True, kw_only=True):
-    """A provider's API, with the key."""
-
     protocol: Protocol
     base_url: str
     """As the vendor's library takes it: OpenAI's with `/v1`, the others' without a version."""

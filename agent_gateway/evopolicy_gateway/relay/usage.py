@@ -34,8 +34,6 @@ class Prices(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
 
 
 class Usage(msgspec.Struct, frozen=True, kw_only=True):
-    """Token counts."""
-
     input_noncached: int = 0
     cache_read: int = 0
     cache_creation: int = 0

@@ -29,8 +29,6 @@ _FORM = '{"env_instances": [0, 1, 1, 7]} or {"env_instances": "0-3,7"}'
 
 
 class Bounds(msgspec.Struct, frozen=True, kw_only=True):
-    """The current limits of a submit."""
-
     n_env_instances: int
     """Train ids are 0 … n − 1."""
     min_episodes: int

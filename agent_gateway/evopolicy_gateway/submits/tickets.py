@@ -61,8 +61,6 @@ Effect = Do | AnyEntry | Exception
 
 
 class _SummaryPart(msgspec.Struct):
-    """The stored fields of a summary."""
-
     mean_return: float | str | None
     policy_failures: int | None = None
     warning: str | None = None

@@ -67,7 +67,6 @@ class SuiteView(View):
         self.event("finished", name, **known, error=entry.error)
 
     def elsewhere(self, name: str, host: str) -> None:
-        """Another host plays it."""
         self.rows[name].state = f"on {host}"
         if self.is_new(name, "host", host):
             self.event("elsewhere", name, host=host)

@@ -37,8 +37,6 @@ FINISH_AGAIN_S = (1.0, 5.0, 30.0)
 
 
 class Sweep(ABC):
-    """Plays the decisions."""
-
     leaves: Leaves
     """Which of its runs cancelling this leaves to be resumed."""
 

@@ -13,8 +13,6 @@ from evopolicy_gateway.submits.episode_files import episode_share, shows_texts
 
 
 class Urls(msgspec.Struct, frozen=True, kw_only=True):
-    """URLs of a run's gateway for its agent."""
-
     info: str
     task: str
     submit: str

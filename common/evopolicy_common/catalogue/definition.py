@@ -200,7 +200,6 @@ def _task(where: str, path: Path, fields: dict[str, Any], task_file: object) -> 
 
 
 def _data(where: str, path: Path, names: tuple[str, ...]) -> tuple[str, ...]:
-    """Absolute paths of the declared data."""
     if len(names) > MAX_DATA:
         raise ConfigError(
             f"{where}: data has {len(names)} names; {MAX_DATA} are the limit: name their folder"

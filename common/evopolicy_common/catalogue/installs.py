@@ -196,8 +196,6 @@ BASE = ("core", "coordinator", "gateway")
 
 
 class Licence(msgspec.Struct, frozen=True, kw_only=True):
-    """The licence of a package, or of assets in it."""
-
     what: str
     """Name of the package, or the assets in words."""
     version: str = ""

@@ -269,7 +269,6 @@ class _Processes:
         self._restarting: list[asyncio.Task[None]] = []
 
     def log(self, name: str) -> Path:
-        """The log file of that process."""
         return self._logs / f"{self._kind}-{name}.log"
 
     async def keep_up(self, name: str, program: Sequence[str], lock: Path | None = None) -> None:

@@ -130,13 +130,11 @@ class Redaction:
 
     @classmethod
     def of(cls, environment: Mapping[str, str], urls: Mapping[str, str]) -> Redaction:
-        """The redaction for an agent with these variables and URLs."""
         named = [value for name, value in environment.items() if is_secret(name)]
         tokens = [token.group(1) for url in urls.values() if (token := _TOKEN_IN_URL.search(url))]
         return cls([*named, *tokens])
 
     def knowing(self, secrets: Iterable[str]) -> Redaction:
-        """The redaction that also removes these."""
         return Redaction((*self.secrets, *secrets))
 
     def __call__(self, line: bytes) -> bytes:

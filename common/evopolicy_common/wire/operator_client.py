@@ -81,7 +81,6 @@ class OperatorClient:
     # Runs.
 
     async def cancel(self, run: str) -> None:
-        """Ends a run without a score."""
         await self._ask("cancel", ops.CancelRun(run=run), ops.Done)
 
     async def agent_gone(self, run: str, boot_id: str = "") -> None:
@@ -115,7 +114,6 @@ class OperatorClient:
         await self._ask("disclose", ops.Disclose(runs=runs), ops.Done)
 
     async def journal(self) -> list[bytes]:
-        """All entries of the coordinator's journal."""
         entries: list[bytes] = []
         while True:
             page = await self._ask("journal", ops.JournalRequest(cursor=len(entries)), ops.JournalPage)
@@ -172,7 +170,6 @@ class OperatorClient:
     # Blobs.
 
     async def upload(self, digest: str, data: bytes) -> None:
-        """Uploads a blob to the coordinator."""
         await self._requests.upload(_SENDER, self._token, digest, data)
 
     async def download(self, digest: str) -> bytes:

@@ -250,5 +250,4 @@ async def _run(options: Options, announce: Callable[[bytes], None]) -> None:
 
 
 def main() -> None:
-    """The console script."""
     run_app(app)

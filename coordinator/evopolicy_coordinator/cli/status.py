@@ -34,8 +34,6 @@ runs_app = App(name="runs", help="Cancel and repin runs.", no_args_is_help=True)
 
 
 def asking(connect: list[str] | None, file: Path | None, work: Callable[[OperatorClient], Awaitable[T]]) -> T:
-    """`work` with a link to the coordinator."""
-
     async def ask() -> T:
         async with transport.connect(credentials.find_running(tuple(connect or ()), file)) as link:
             return await work(OperatorClient(link))

@@ -81,7 +81,6 @@ class Core:
         return at
 
     def handle_deadline(self, now: float) -> list[Effect]:
-        """Process all deadlines due at `now`."""
         self._watch(now)
         effects: list[Effect] = []
         while (key := self.state.timers.pop_due(now)) is not None:

@@ -30,8 +30,6 @@ _MAX_RESULT_BYTES = 1 << 16
 
 
 class ClaimRow(msgspec.Struct, frozen=True, kw_only=True):
-    """The stored part of a claim."""
-
     holder: str
     run: str = ""
     ttl_s: float = 0.0

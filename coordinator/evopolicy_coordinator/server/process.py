@@ -55,8 +55,6 @@ _PAUSE_S = 0.1
 
 
 class Options(msgspec.Struct, frozen=True, kw_only=True):
-    """Start options of a coordinator."""
-
     state: Path
     data: Path | None = None
     """Folder of split files; None: derive the splits from the state folder's secret."""

@@ -150,7 +150,6 @@ class Service:
     # Queries in.
 
     def on_queries(self, batch: list[IncomingQuery]) -> None:
-        """Handles one tick's queries."""
         for query in batch:
             try:
                 self._receive(query)

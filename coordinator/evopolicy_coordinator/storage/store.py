@@ -65,8 +65,6 @@ _encode = msgspec.msgpack.Encoder().encode
 
 
 class _Place(NamedTuple):
-    """Where the rows of a kind are stored."""
-
     table: str
     key: tuple[str, ...]
     lookup: tuple[str, ...] = ()
@@ -267,7 +265,6 @@ class Reader:
             return _only(rows(self._db, kind, f"WHERE {where}", tuple(key.values())))
 
     def bundles(self, run: str) -> frozenset[str | None]:
-        """The bundles that the run's submits name."""
         with self._db.errors():
             return frozenset(row.bundle for row in rows(self._db, records.SubmitRow, "WHERE run = ?", (run,)))
 

@@ -117,7 +117,6 @@ class Site:
 
     @property
     def status(self) -> StatusReply | None:
-        """The coordinator's last status."""
         return None if self.cluster is None else self.cluster.status
 
     async def refresh(self) -> None:
@@ -306,7 +305,6 @@ class Site:
         return self._page(request, "message", status, title=title, text=text, back="/")
 
     def app(self) -> ASGIApp:
-        """The application with its guards."""
         routes = [
             Route("/", self.home),
             Route("/cluster", self.cluster_page),

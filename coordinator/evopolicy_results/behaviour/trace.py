@@ -28,8 +28,6 @@ MAX_DIFF_LINES = 1500
 
 
 class TraceRow(msgspec.Struct, frozen=True, kw_only=True):
-    """One accepted submit."""
-
     submit: Submit
     transition: Transition | None
     """None for a submit without a score."""

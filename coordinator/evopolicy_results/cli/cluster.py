@@ -47,8 +47,6 @@ def first(lines: Sequence[str]) -> list[str]:
 
 
 class Where:
-    """The cluster that the options name."""
-
     def __init__(
         self,
         connect: list[str] | None,

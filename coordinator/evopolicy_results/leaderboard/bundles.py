@@ -41,8 +41,6 @@ Replay = Callable[[Archive, Checked], None]
 
 
 class LabRun(msgspec.Struct, frozen=True, kw_only=True):
-    """A published run and its run directory."""
-
     run: Run
     published: str
     """The coordinator's id."""

@@ -61,8 +61,6 @@ _ALWAYS = (
 
 
 class Source(NamedTuple):
-    """A published run."""
-
     folder: str
     record: RunRecord
     result: Result

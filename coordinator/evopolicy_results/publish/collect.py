@@ -108,8 +108,6 @@ class _Secret(NamedTuple):
 
 
 class _Source(NamedTuple):
-    """A run that is published."""
-
     folder: Path
     record: RunRecord
     passed: Passed | None

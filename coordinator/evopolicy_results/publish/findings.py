@@ -62,8 +62,6 @@ class Finding(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Files(Protocol):
-    """The files of published results."""
-
     @property
     def names(self) -> frozenset[str]: ...
 
@@ -197,7 +195,6 @@ class History(NamedTuple):
     heads: list[str]
 
     def entry(self, kind: type[T], run: str) -> tuple[int, T] | None:
-        """The number and content of a run's entry."""
         entries = enumerate(self.entries)
         return next(
             ((n, one) for n, one in entries if isinstance(one, kind) and getattr(one, "run", "") == run), None

@@ -44,8 +44,6 @@ _MAX_STAMP_CHARS = 64
 
 
 class LogEvent(msgspec.Struct, frozen=True, kw_only=True):
-    """One event of the log, in the order of the stream."""
-
     message: str = ""
     """Text that the agent wrote, not a tool's."""
     read: tuple[str, ...] = ()
@@ -73,8 +71,6 @@ class Evidence(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class LogReading(msgspec.Struct, frozen=True, kw_only=True):
-    """The attributed events of a whole log."""
-
     by_submit: dict[int, Evidence] = {}
     unplaced: tuple[str, ...] = ()
     """Messages from a log that shows no submits, or after the last submit."""

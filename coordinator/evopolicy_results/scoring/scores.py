@@ -122,7 +122,6 @@ class ScoreTable(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def agents(self) -> list[str]:
-        """Entries without the reference."""
         return [entry for entry in self.entries if entry != self.reference]
 
     @property
@@ -306,7 +305,6 @@ def rank_score(rank: int, n: int) -> float | None:
 
 
 def leaderboard(table: ScoreTable) -> Leaderboard:
-    """Ranks `table` as one suite."""
     envs = table.environments
     played = {entry: [env for env in envs if (entry, env) in table.cells] for entry in table.entries}
     complete = [entry for entry in table.entries if len(played[entry]) == len(envs)]

@@ -47,8 +47,6 @@ from evopolicy_results.statistics.worlds import Worlds, worlds_of
 
 
 class SuiteStatistics(msgspec.Struct, frozen=True, kw_only=True):
-    """The uncertainty of a suite's scores."""
-
     means: dict[tuple[str, str], Estimate]
     """Held-out mean by (entry, env); cells without a mean are absent."""
     pairs: tuple[Pair, ...]
@@ -64,8 +62,6 @@ class SuiteStatistics(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Suite(msgspec.Struct, frozen=True, kw_only=True):
-    """The scores of one suite's environments."""
-
     name: str
     table: ScoreTable
     board: Leaderboard

@@ -98,8 +98,6 @@ def _character(character: str) -> str:
 
 
 class _Column(msgspec.Struct, frozen=True):
-    """One column with its cells by row, as LaTeX."""
-
     column: Column
     cells: list[str]
     is_long: bool

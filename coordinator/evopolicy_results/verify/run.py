@@ -86,8 +86,6 @@ class _Recording(msgspec.Struct, kw_only=True):
 
 
 class Verifier:
-    """One verification on one cluster."""
-
     def __init__(self, evaluations: Evaluations, run: RunUnderTest) -> None:
         self._evaluations = evaluations
         self._run = run

@@ -231,8 +231,6 @@ class Player:
 
 @dataclass
 class _Episode:
-    """One episode from reset to its end."""
-
     job: Job
     k: int
     """The episode's index in the job."""

@@ -68,8 +68,6 @@ class Order(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Made(msgspec.Struct, frozen=True, kw_only=True):
-    """The answer to an order."""
-
     mp4: bytes | None
     error: str = ""
     """Why there is no video."""
@@ -247,7 +245,6 @@ def serve(env_id: str, orders: BinaryIO, replies: BinaryIO) -> None:
 
 
 def main() -> None:
-    """The process's entry."""
     orders, replies = take_pipes()
     with os.fdopen(orders, "rb") as reader, os.fdopen(replies, "wb") as writer:
         env_id, *definitions = sys.argv[1:]

@@ -63,7 +63,6 @@ _own_folders: dict[str, str] = {}
 
 
 def variables(scratch: Path) -> dict[str, str]:
-    """All environment variables of the process."""
     own = {name: os.environ[name] for name in os.environ if name.startswith(_PASSED_ON_PREFIXES)}
     own |= {name: os.environ[name] for name in _PASSED_ON if name in os.environ}
     path = [os.path.abspath(entry) for entry in _folders("PYTHONPATH")]

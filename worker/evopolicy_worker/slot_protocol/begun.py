@@ -36,8 +36,6 @@ _BLOCK_BYTES = 64 << 10
 
 
 class Returned(NamedTuple):
-    """One action of the policy."""
-
     returned: Any
     """As the policy returned it; in an episode that started elsewhere, `action`."""
     action: Any

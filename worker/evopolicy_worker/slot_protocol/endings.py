@@ -40,8 +40,6 @@ class EndedFromOutsideError(SandboxError):
 
 
 class Ending(NamedTuple):
-    """The known facts of an ending."""
-
     first: First
     how: How
     limit: FailureCategory | None = None
@@ -72,7 +70,6 @@ class Row(NamedTuple):
     again: bool | None = None
 
     def fits(self, ending: Ending) -> bool:
-        """Whether an ending is of this kind."""
         wanted = (self.first, self.limit, self.began, self.held, self.again)
         facts = (ending.first, ending.limit is not None, ending.began, ending.held, ending.again)
         known = all(want in (None, fact) for want, fact in zip(wanted, facts, strict=True))

@@ -77,8 +77,6 @@ class Ready(Message, frozen=True, kw_only=True):
 
 
 class Progress(Message, frozen=True, kw_only=True):
-    """Progress of the running job."""
-
     episodes_done: int
     steps: int
 

@@ -69,8 +69,6 @@ _LEAST_QUOTA_WAIT_S = 60.0
 
 @dataclass(frozen=True, kw_only=True)
 class Call:
-    """A command that the model calls."""
-
     id: str
     name: str = shell.NAME
     given: dict[str, Any] = field(default_factory=dict)
@@ -83,8 +81,6 @@ class Call:
 
 @dataclass(frozen=True, kw_only=True)
 class Reply:
-    """One answer of the model."""
-
     text: str
     calls: tuple[Call, ...]
     fault: str = ""
@@ -142,7 +138,6 @@ class Conversation:
         return json.dumps({"streams": self._streams, "messages": messages}).encode()
 
     def say(self, text: str) -> None:
-        """Adds a prompt."""
         system: list[ModelRequestPart] = [] if self.messages else [SystemPromptPart(self._system)]
         self.messages.append(ModelRequest([*system, UserPromptPart(text)]))
 
@@ -219,7 +214,6 @@ class Conversation:
         return response
 
     def answer(self, calls: Sequence[Call], outputs: Sequence[str]) -> None:
-        """Adds the commands' outputs."""
         pairs = zip(calls, outputs, strict=True)
         parts = [ToolReturnPart(call.name, output, tool_call_id=call.id) for call, output in pairs]
         self.messages.append(ModelRequest(parts))

@@ -274,7 +274,6 @@ class _Link:
             self.updates.put_nowait(update)
 
     def arrived(self) -> Iterator[dict[str, Any]]:
-        """Yields the updates that have arrived."""
         while not self.updates.empty():
             yield self.updates.get_nowait()
 

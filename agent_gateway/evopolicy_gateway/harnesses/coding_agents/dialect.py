@@ -48,8 +48,6 @@ class TurnReader(ABC):
 
 
 class Dialect(ABC):
-    """One kind of CLI."""
-
     name: str
     program: tuple[str, ...]
     """The default program."""
@@ -99,7 +97,6 @@ class Dialect(ABC):
         return {}
 
     def required_options(self) -> list[str]:
-        """Options that its help must list."""
         return []
 
     def version_in(self, text: str) -> str | None:

@@ -15,8 +15,6 @@ from evopolicy_gateway.relay.usage import Usage
 
 
 class SessionState(msgspec.Struct, kw_only=True):
-    """State of one run's agent session."""
-
     session: str | None = None
     """The CLI's id of the session; None until the CLI has reported it."""
     cli_version: str | None = None

@@ -99,8 +99,6 @@ class Stage(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Harness(ABC):
-    """One kind of agent."""
-
     name: str
     """Name in `run.json`: `command`, `replay`, `evolve`, …"""
     command: Sequence[str] = ()

@@ -82,8 +82,6 @@ class NpzWriter:
 
 
 class _Member:
-    """One array of the file."""
-
     def __init__(self, dtype: np.dtype[Any], shape: tuple[int, ...]) -> None:
         if dtype.hasobject:
             raise ProtocolError(

@@ -21,8 +21,6 @@ _SUBMIT = re.compile(r"submit_([0-9]{3,9})")
 
 
 class SubmitFiles:
-    """A submit's files in a run directory."""
-
     def __init__(self, run: Confined, index: int, feedback: str, checkpoint: str, most: int) -> None:
         """`feedback` and `checkpoint`: its folders, relative to the run; `most`: bytes of a summary."""
         self.index = index

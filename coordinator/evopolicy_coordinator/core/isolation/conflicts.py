@@ -42,7 +42,6 @@ def kernel(state: State, boot_id: str) -> Kernel:
 
 
 def tidy(state: State, kernel: Kernel) -> None:
-    """Forget a kernel without occupants."""
     present = (kernel.workers, kernel.permits, kernel.asks, kernel.hidden, kernel.train, kernel.reservations)
     if kernel is not state.everywhere and not any(present):
         state.kernels.pop(kernel.boot_id, None)

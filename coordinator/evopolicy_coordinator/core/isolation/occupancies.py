@@ -153,7 +153,6 @@ def joined(state: State, worker: Worker, step: Step) -> None:
 
 
 def forgotten(state: State, worker: Worker) -> None:
-    """Remove a worker from its kernel."""
     if state.workers.get(worker.name) is not worker:
         worker.kernel.workers.pop(worker.name, None)
         conflicts.tidy(state, worker.kernel)

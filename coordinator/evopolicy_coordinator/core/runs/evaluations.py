@@ -59,7 +59,6 @@ def enter(state: State, row: EvaluationRow) -> Evaluation:
 
 
 def play(state: State, evaluation: Evaluation, step: Step) -> None:
-    """Queue the episodes of an evaluation."""
     group = templates.evaluation(evaluation, step)
     groups.open_group(state, group, step)
 

@@ -47,7 +47,6 @@ class Timers:
             self.arm(key, at)
 
     def disarm(self, key: TimerKey) -> None:
-        """Remove the deadline of `key`, if it has one."""
         self._armed.pop(key, None)
 
     def next(self) -> float | None:
@@ -74,8 +73,6 @@ PollKind = Literal["results", "evaluation", "run", "permit"]
 
 
 class Poll(NamedTuple):
-    """A waiting request."""
-
     request: RequestId
     kind: PollKind
     target: str

@@ -262,7 +262,6 @@ class JobGroup:
 
     @property
     def n(self) -> int:
-        """Number of its episodes."""
         return len(self.template.cases)
 
     @property
@@ -528,8 +527,6 @@ Occupancies = dict[CaseSet | None, dict[str, Occupancy]]
 
 
 class Ask(NamedTuple):
-    """A requested permit."""
-
     row: PermitRow
     case_set: CaseSet
     kernel: Kernel
@@ -576,8 +573,6 @@ class LeasePoll(NamedTuple):
 
 @dataclass(slots=True, eq=False)
 class Worker:
-    """One worker as the core knows it."""
-
     name: str
     session: str
     slots: int

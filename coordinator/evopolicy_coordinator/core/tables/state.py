@@ -58,8 +58,6 @@ class Loading:
 
 
 class State:
-    """The state that all rules share."""
-
     def __init__(self, settings: CoreSettings, incarnation: int, now: float) -> None:
         self.settings = settings
         self.incarnation = incarnation
@@ -195,7 +193,6 @@ class CaseSets:
         return case_set
 
     def known(self) -> Iterable[CaseSet]:
-        """Returns all case sets in use."""
         return self._known.values()
 
     def leave(self, case_set: CaseSet | None) -> None:

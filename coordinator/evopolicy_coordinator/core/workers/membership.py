@@ -72,7 +72,6 @@ def worker_of(
 
 
 def lease_requested(state: State, event: events.Requested[wire.LeaseRequest], step: Step) -> None:
-    """A worker polls for leases."""
     scheduler.poll(state, worker_of(state, event, step), event, step)
 
 

@@ -43,7 +43,6 @@ MAX_LENGTH = 2**31 - 1
 
 
 def take(state: State, news: ResultsPersisted, step: Step) -> None:
-    """Process one result of a result report."""
     worker, result = news.worker, news.result
     job = state.jobs.get(result.job_id)
     lease = worker.leases.get(result.lease_id)

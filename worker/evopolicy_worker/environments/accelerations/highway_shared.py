@@ -27,8 +27,6 @@ DOUBT = 1e-6
 
 
 class Scene(AbstractEnv):  # type: ignore[misc]
-    """An environment with prepared scenes."""
-
     _on_road: tuple[Callable[[Any], None], ...] = ()
     _on_vehicles: tuple[Callable[[Any], None], ...] = ()
 

@@ -22,8 +22,6 @@ Fields = tuple[tuple[str, str], ...]
 
 
 class PageText(msgspec.Struct, frozen=True):
-    """The package's documentation of a page."""
-
     description: str = ""
     examples: tuple[str, ...] = ()
     """Instructions, as an episode may give them."""

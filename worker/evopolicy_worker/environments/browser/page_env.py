@@ -95,7 +95,6 @@ class PageEnv(gymnasium.Env[Any, Any]):
 
     @property
     def page(self) -> Page:
-        """The page of this process's browser."""
         return shared()
 
     def reset(

@@ -146,7 +146,6 @@ def _rendered(played: CheckResult, plain: Environment, steps: int) -> str:
 
 
 def _checked(played: CheckResult, environment: Environment, steps: int) -> Iterator[tuple[Any, Step]]:
-    """Plays an episode, and checks everything in it."""
     description, seed = environment.description, SEEDS[0]
     recorder = Renderer("arrays", description.obs_storage)
     obs: Any = None
@@ -336,7 +335,6 @@ def digest(environment: Environment, seed: int, steps: int, *, drawn: bool = Fal
 
 
 def digest_of(episode: Iterator[tuple[Any, Step]]) -> str:
-    """The digest of an episode that `rollout` plays."""
     state = hashlib.sha256()
     for n, (_, step) in enumerate(episode):
         add(state, tuple(step) if n else step.obs)

@@ -57,7 +57,6 @@ class _Console(Adapted):
             self.raw = None
 
     def _taken(self) -> Any:
-        """The emulator with this console's game."""
         if _Console._holding is self:
             return self.raw
         if _Console._holding is not None:

@@ -39,8 +39,6 @@ MAX_ITEMS = 256
 
 
 class ActionCodec(ABC):
-    """An action space, compiled."""
-
     @abstractmethod
     def repair(self, raw: object) -> tuple[Any, bool]:
         """A valid action for what the policy returned, and whether that changed its meaning. Never raises."""
@@ -246,8 +244,6 @@ class _Dict(ActionCodec):
 
 
 class _Tuple(_Dict):
-    """Its parts by position."""
-
     def __init__(self, schema: SpaceSchema) -> None:
         super().__init__({"spaces": dict(enumerate(schema["spaces"]))})
 

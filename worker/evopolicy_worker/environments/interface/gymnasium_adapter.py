@@ -239,7 +239,6 @@ class Adapted:
         return self.raw.render()
 
     def close(self) -> None:
-        """Frees what it holds."""
         if self.raw is not None:
             self.raw.close()
 

@@ -118,8 +118,6 @@ class MissingParameterError(KeyError):
 
 
 class NoParameters(dict[str, Any]):
-    """The parameters of an environment: none."""
-
     def __missing__(self, name: str) -> Any:
         raise MissingParameterError(name)
 
