@@ -25,6 +25,7 @@ from evopolicy_common.errors import ConfigError
 from evopolicy_results.behaviour.trace import trace
 from evopolicy_results.figures import drawings_of, timelines_of
 from evopolicy_results.figures.plot import Plot
+from evopolicy_results.html import page
 from evopolicy_results.html.pages import (
     FORMS,
     PlayedEpisode,
@@ -33,7 +34,6 @@ from evopolicy_results.html.pages import (
     run_title,
     trace_page,
 )
-from evopolicy_results.html.rendering import page
 from evopolicy_results.reading.environments import grouped, names_in_runs, ordered_environments
 from evopolicy_results.reading.parallel import ALONE, Processes
 from evopolicy_results.reading.records import Run, path_text

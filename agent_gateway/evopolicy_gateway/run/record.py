@@ -48,9 +48,9 @@ from evopolicy_gateway.run import replays
 from evopolicy_gateway.run.operations import Operations
 from evopolicy_gateway.run.plan import Plan
 from evopolicy_gateway.run.times import Times
-from evopolicy_gateway.run.transitions import count_transitions
 from evopolicy_gateway.run_folder.journal import Journal
 from evopolicy_gateway.run_folder.layout import RunFolder, Staged, saved, submit_id
+from evopolicy_gateway.submits.feedback import count_transitions
 
 _RESUMABLE = (OSError, StorageError, TransportError, ConfigError)
 """Errors with a remedy, after which `--resume` writes everything."""

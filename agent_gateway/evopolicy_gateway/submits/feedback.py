@@ -13,6 +13,7 @@ import asyncio
 import contextlib
 import errno
 import os
+import stat
 import threading
 import time
 from collections.abc import Callable, Mapping
@@ -26,10 +27,12 @@ from evopolicy_common.errors import ProtocolError, RefusedError
 from evopolicy_common.logs import structlog
 from evopolicy_common.messages.episode import BlobRef
 from evopolicy_common.messages.gateway import EpisodeFeedback, ResultsPage, SubmitDone
+from evopolicy_common.processes.left_files import left_files
 from evopolicy_common.processes.scratch import give_back_rights, remove_tree
 from evopolicy_common.records.blobs import fsync_directory, sync_filesystem
 from evopolicy_common.records.open_run import Accepted
 from evopolicy_common.refusals import Refusal
+from evopolicy_common.regular_files import open_regular
 from evopolicy_gateway.run_folder.journal import AtWork, write_all
 from evopolicy_gateway.run_folder.layout import episode_name
 from evopolicy_gateway.submits import formatting
@@ -294,3 +297,34 @@ def _remove(path: Path) -> None:
             raise OSError(errno.ENOTEMPTY, "an entry in feedback/ cannot be removed", str(path))
     else:
         path.unlink(missing_ok=True)
+
+
+MAX_READ_BYTES = 8 << 30
+"""Larger feedback is not counted: an agent without a jail may leave sparse files of any size."""
+_INVALID = b'"action_invalid":true'
+"""As written by `json_text.rows_text`. Quotes within a text are escaped there, so no text contains these bytes."""
+
+
+def count_transitions(feedback: Path) -> dict[str, int] | None:
+    """Over all recorded train episodes: `steps`, and as `action_invalid` those whose action was outside the action
+    space and was repaired. None when the feedback is too large or cannot be read."""
+    counts = {"steps": 0, "action_invalid": 0}
+    try:
+        if not stat.S_ISDIR(os.lstat(feedback).st_mode):
+            return None
+        files = {
+            path: size
+            for path, size in left_files(feedback)
+            if path.name == "trajectory.jsonl" and path.parent.parent.name == "episodes"
+        }
+        if sum(files.values()) > MAX_READ_BYTES:
+            return None
+        for path in files:
+            # The file may have become a link or a pipe since it was listed.
+            with open_regular(path) as file:
+                for line in file:
+                    counts["steps"] += line.endswith(b"\n")
+                    counts["action_invalid"] += _INVALID in line
+    except OSError:
+        return None
+    return counts

@@ -41,7 +41,7 @@ from evopolicy_coordinator.web.content.run_folders import Reader, RunFacts, Runs
 from evopolicy_coordinator.web.views.cluster import cluster_view
 from evopolicy_coordinator.web.views.run import episode_values, file_link, live_run_view, submit_values
 from evopolicy_coordinator.web.views.sweeps import sweeps_view
-from evopolicy_results.html.rendering import View
+from evopolicy_results.html import View
 
 _FORM_WAIT_S = 10.0
 _SCAN_S = 1.0

@@ -13,8 +13,7 @@ from evopolicy_common.records.words import in_words
 from evopolicy_common.terminal import number
 from evopolicy_results.behaviour.trace import Trace, diff, sources
 from evopolicy_results.figures.plot import Plot
-from evopolicy_results.html import notice, section, visible
-from evopolicy_results.html.rendering import page
+from evopolicy_results.html import notice, page, section, visible
 from evopolicy_results.html.run_page import run_view, submit_rows
 from evopolicy_results.reading.environments import grouped, title_of
 from evopolicy_results.reading.records import Run

@@ -17,7 +17,7 @@ from evopolicy_results.behaviour.trace import Trace, TraceRow
 from evopolicy_results.figures.line_chart import Line, chart
 from evopolicy_results.figures.plot import inline_svg
 from evopolicy_results.figures.timelines import Row, timeline_svg
-from evopolicy_results.html.rendering import View, part
+from evopolicy_results.html import View, part
 from evopolicy_results.reading.agent_log import Evidence
 from evopolicy_results.reading.environments import title_of
 from evopolicy_results.reading.records import Submit

@@ -18,9 +18,8 @@ from typing import Any, NamedTuple
 
 import msgspec
 
-from evopolicy_results.html import notice, section
+from evopolicy_results.html import notice, page, section
 from evopolicy_results.html.pages import table_view
-from evopolicy_results.html.rendering import page
 from evopolicy_results.leaderboard.bundles import Board, LabBundle, LabRun, boards
 from evopolicy_results.publish.findings import KINDS
 from evopolicy_results.reading.environments import title_of

@@ -18,7 +18,7 @@ from invented.run_dirs import amend, write_run
 
 from evopolicy_common.terminal import harmless
 from evopolicy_coordinator.web.content.rendering import _environment as live_environment
-from evopolicy_results.html.rendering import environment
+from evopolicy_results.html import environment
 from evopolicy_results.report import write_report
 from evopolicy_results.studies.study import study
 from evopolicy_results.tables.latex import to_latex

@@ -14,7 +14,7 @@ from typing import Any
 
 import msgspec
 
-from evopolicy_results.html.rendering import View
+from evopolicy_results.html import View
 
 LEAST_PAUSE_S = 0.5
 """Between two updates of one browser."""

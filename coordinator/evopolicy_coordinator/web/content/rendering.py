@@ -15,8 +15,8 @@ from jinja2 import ChoiceLoader, Environment, PackageLoader
 
 from evopolicy_common.records.words import in_words
 from evopolicy_coordinator.web.content.run_folders import key_of
-from evopolicy_results.html import rendering as html
-from evopolicy_results.html.rendering import View
+from evopolicy_results import html
+from evopolicy_results.html import View
 
 T = TypeVar("T")
 

@@ -19,8 +19,7 @@ from evopolicy_coordinator.web.content.remarks import remarks, served_by
 from evopolicy_coordinator.web.content.rendering import PAGE_ROWS, Words, ident, paged, part, short
 from evopolicy_coordinator.web.content.run_folders import RunFacts, Runs
 from evopolicy_results.figures.line_chart import Line, chart
-from evopolicy_results.html import notice
-from evopolicy_results.html.rendering import View
+from evopolicy_results.html import View, notice
 from evopolicy_results.reading.environments import title_of
 
 _NOTICE_LINES = 5

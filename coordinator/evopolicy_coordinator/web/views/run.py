@@ -23,8 +23,7 @@ from evopolicy_coordinator.web.content.run_detail import IMAGES, MAX_WORDS, Code
 from evopolicy_coordinator.web.content.run_folders import Reader, RunFacts, Runs, Submit
 from evopolicy_results.behaviour.trace import Trace, diff, trace
 from evopolicy_results.figures.line_chart import chart
-from evopolicy_results.html import notice
-from evopolicy_results.html.rendering import View
+from evopolicy_results.html import View, notice
 from evopolicy_results.html.run_page import SubmitRow, run_view, submit_rows
 from evopolicy_results.reading.reader import read_run
 from evopolicy_results.reading.records import Submit as Shown

@@ -13,8 +13,7 @@ from evopolicy_common.terminal import counted, duration, number
 from evopolicy_coordinator.web.content.cluster import Cluster
 from evopolicy_coordinator.web.content.rendering import STATES, Words, ident, paged, part, short, state_words
 from evopolicy_coordinator.web.content.run_folders import RunFacts, Runs, Sweep
-from evopolicy_results.html import notice
-from evopolicy_results.html.rendering import View
+from evopolicy_results.html import View, notice
 from evopolicy_results.reading.environments import title_of
 from evopolicy_results.studies.palette import Look, looks
 

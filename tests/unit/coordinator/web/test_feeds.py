@@ -7,7 +7,7 @@ import json
 from typing import Any
 
 from evopolicy_coordinator.web.content.feeds import LEAST_PAUSE_S, Feed, Feeds
-from evopolicy_results.html.rendering import View
+from evopolicy_results.html import View
 
 
 def view(rows: dict[str, str], **parts: str) -> View:

@@ -6,8 +6,7 @@ import os
 from pathlib import Path
 
 from evopolicy_common.records.json_text import rows_text
-from evopolicy_gateway.run import transitions
-from evopolicy_gateway.run.transitions import count_transitions
+from evopolicy_gateway.submits.feedback import MAX_READ_BYTES, count_transitions
 
 TEXT = '"action_invalid":true'
 """A text that a policy may return as its action, or an environment may show."""
@@ -47,5 +46,5 @@ def test_feedback_that_is_absent_a_link_or_too_large_is_not_counted(tmp_path: Pa
     folder = write(tmp_path / "feedback", 0, 0, {})
     (tmp_path / "link").symlink_to(tmp_path / "feedback")
     assert count_transitions(tmp_path / "link") is None
-    os.truncate(folder / "trajectory.jsonl", transitions.MAX_READ_BYTES + 1)  # a hole, which takes no room
+    os.truncate(folder / "trajectory.jsonl", MAX_READ_BYTES + 1)  # a hole, which takes no room
     assert count_transitions(tmp_path / "feedback") is None
