@@ -13,7 +13,6 @@ from evopolicy_common.messages.episode import (
     FailureCategory,
     Job,
     PolicyFailure,
-    ResourceLimits,
 )
 from evopolicy_common.messages.operator import RunFinished
 from evopolicy_common.messages.run_settings import RunSettings
@@ -340,6 +339,3 @@ def result(lease: wire.Lease, kind: wire.ResultKind, **more: Any) -> wire.JobRes
 def split_of(job: Job) -> str:
     """Which list a job is from: train, validation, heldout, random or an evaluation's."""
     return job.job_id.rsplit("/", 2)[1]
-
-
-NO_LIMITS = ResourceLimits()
