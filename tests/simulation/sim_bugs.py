@@ -20,7 +20,7 @@ from evopolicy_coordinator.core import loading, machine
 from evopolicy_coordinator.core.agents import permits, precedence, requests
 from evopolicy_coordinator.core.isolation import conflicts, occupancies
 from evopolicy_coordinator.core.leasing import expiry, fleet, groups, leases, queue
-from evopolicy_coordinator.core.runs import finalisation, finished, result_polls, submits, templates
+from evopolicy_coordinator.core.runs import finalisation, finished, submits, templates
 from evopolicy_coordinator.core.structures.ledger import Ledger
 from evopolicy_coordinator.core.tables.model import Profile
 from evopolicy_coordinator.core.tables.state import CaseSets, State
@@ -119,7 +119,7 @@ BUGS = (
     Bug("count attempts from one after a restart", State, "__init__", "(incarnation - 1) *", "0 *", seed=13),
     Bug(
         "show episodes before the gate",
-        result_polls,
+        submits,
         "_released",
         "if 0 in group.digests",
         "if True",

@@ -23,15 +23,7 @@ from evopolicy_coordinator.core.contract.records import Snapshot
 from evopolicy_coordinator.core.contract.settings import CoreSettings
 from evopolicy_coordinator.core.isolation import occupancies
 from evopolicy_coordinator.core.leasing import expiry, fleet, queue
-from evopolicy_coordinator.core.runs import (
-    evaluations,
-    finalisation,
-    finished,
-    journal,
-    result_polls,
-    runs,
-    submits,
-)
+from evopolicy_coordinator.core.runs import evaluations, finalisation, finished, journal, runs, submits
 from evopolicy_coordinator.core.status import Words
 from evopolicy_coordinator.core.tables import step
 from evopolicy_coordinator.core.tables.model import LaneKey
@@ -116,7 +108,7 @@ class Core:
         if this.news:
             drain(self.state, this)
         for group in this.grown:
-            result_polls.answer_polls(self.state, group, this)
+            submits.answer_polls(self.state, group, this)
         if this.last is not None:
             this.add(this.last)
         scheduler.dispatch(self.state, this)
@@ -156,7 +148,7 @@ EVENTS: dict[type, Rule] = {
     gateway.RequestPermit: requests.requested,
     gateway.StateRequest: runs.state_requested,
     gateway.Submit: submits.submit,
-    gateway.ResultsRequest: result_polls.results,
+    gateway.ResultsRequest: submits.results,
     gateway.CloseRun: finalisation.close,
     wire.Register: membership.registered,
     wire.LeaseRequest: membership.lease_requested,
@@ -208,7 +200,7 @@ def _check_lane(state: State, key: LaneKey, this: Step) -> None:
 
 
 POLLS: Mapping[str, Rule] = {
-    "results": result_polls.answer,
+    "results": submits.answer,
     "evaluation": evaluations.answer,
     "permit": requests.answer,
     "run": finished.answer,

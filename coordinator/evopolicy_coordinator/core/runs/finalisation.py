@@ -28,7 +28,7 @@ from evopolicy_coordinator.core.contract.records import (
     submit_group,
 )
 from evopolicy_coordinator.core.leasing import groups
-from evopolicy_coordinator.core.runs import evaluations, finished, journal, result_polls, runs, templates
+from evopolicy_coordinator.core.runs import evaluations, finished, journal, runs, submits, templates
 from evopolicy_coordinator.core.tables.model import JobGroup, Run
 from evopolicy_coordinator.core.tables.state import State
 from evopolicy_coordinator.core.tables.step import (
@@ -155,7 +155,7 @@ def _cancel(state: State, run: Run, step: Step, *, error: str | None = None) -> 
         step.change_submit(run, index, status="cancelled", completed_at=step.now, refunded=True)
         group = state.groups[submit_group(run.id, index, "train")]
         groups.close_group(state, group, step)
-        result_polls.answer_polls(state, group, step)
+        submits.answer_polls(state, group, step)
     if run.state.phase == "open":
         step.change_run(run, phase="closed", closed_at=step.now, close_reason=gateway.CANCELLED)
         permits.cancelled(state, run.id, step)
