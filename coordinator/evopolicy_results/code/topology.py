@@ -48,25 +48,21 @@ _SKIPPED_FIELDS = frozenset({"ctx", "type_comment", "type_params", "annotation",
 def describe(modules: Mapping[str, Module]) -> tuple[str, Features]:
     """Topology (32 hex digits) and features of a bundle's reachable modules, as `reachable_modules` orders them."""
     texts: list[str] = []
-    total = Features()
+    found: list[Features] = []
     for module in modules.values():
         lines = module.source.count(b"\n") + (not module.source.endswith(b"\n"))
-        found = Features(lines=lines)
-        text = module.source.hex()  # of one that cannot be parsed
+        text, features = module.source.hex(), Features(lines=lines)  # of one that cannot be parsed
         with suppress(RecursionError):
             if module.nodes:
                 parts = list(_stripped(module.nodes[0]))
+                features = _features(module.nodes, parts.count("("), lines)
                 text = " ".join(parts)
-                found = _features(module.nodes, parts.count("("), lines)
         texts.append(text)
-        total = Features(
-            **{
-                name: (max if name == "depth" else int.__add__)(getattr(total, name), getattr(found, name))
-                for name in Features.__struct_fields__
-            }
-        )
+        found.append(features)
     joined = "\x1f".join(texts).encode("utf-8", "surrogatepass")
-    return hashlib.blake2b(joined, digest_size=16).hexdigest(), total
+    total = {name: sum(getattr(each, name) for each in found) for name in Features.__struct_fields__}
+    total["depth"] = max((each.depth for each in found), default=0)
+    return hashlib.blake2b(joined, digest_size=16).hexdigest(), Features(**total)
 
 
 def _stripped(node: ast.AST) -> Iterator[str]:
@@ -94,8 +90,9 @@ def _features(nodes: tuple[ast.AST, ...], n_nodes: int, lines: int) -> Features:
         for method in (each for each in owner.body if isinstance(each, _FUNCTIONS)):
             instance = next((each.arg for each in (*method.args.posonlyargs, *method.args.args)), None)
             for each in ast.walk(method):
-                is_stored = isinstance(each, ast.Attribute) and isinstance(each.ctx, ast.Store)
-                if is_stored and getattr(each.value, "id", None) == instance:
+                if not (isinstance(each, ast.Attribute) and isinstance(each.ctx, ast.Store)):
+                    continue
+                if getattr(each.value, "id", None) == instance:
                     attributes.add((id(owner), each.attr))
     declared = {name for each in nodes if isinstance(each, ast.Global) for name in each.names}
     return Features(
