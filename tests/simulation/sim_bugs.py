@@ -19,7 +19,7 @@ from sim_store import Disk
 from evopolicy_coordinator.core import loading, machine
 from evopolicy_coordinator.core.agents import permits, precedence, requests
 from evopolicy_coordinator.core.isolation import conflicts, occupancies
-from evopolicy_coordinator.core.leasing import expiry, fleet, groups, leases, queue
+from evopolicy_coordinator.core.leasing import fleet, groups, leases, queue
 from evopolicy_coordinator.core.runs import finalisation, finished, submits, templates
 from evopolicy_coordinator.core.structures.ledger import Ledger
 from evopolicy_coordinator.core.tables.model import Profile
@@ -104,7 +104,7 @@ BUGS = (
     ),
     Bug("forget to queue after a back-off", queue, "backed_off", "if job is not None", "if False", seed=10),
     Bug("forget the adoption timer", loading, "load", "if state.adopting:", "if False:", seed=5),
-    Bug("forget the worker's timer", expiry, "check_due", "if deadlines:", "if False:"),
+    Bug("forget the worker's timer", membership, "check_due", "if deadlines:", "if False:"),
     Bug(
         "skip the fencing",
         results,
@@ -207,7 +207,7 @@ BUGS = (
     Bug("forget to tell a worker to stop", leases, "hear", "stop.append(item.lease_id)", "pass", seed=13),
     Bug(
         "leave a lost worker's leases with it",
-        expiry,
+        membership,
         "_take_all",
         "list(worker.leases.values())",
         "[]",

@@ -22,7 +22,7 @@ from evopolicy_coordinator.core.contract.reasons import NotDoneError, Reason
 from evopolicy_coordinator.core.contract.records import Snapshot
 from evopolicy_coordinator.core.contract.settings import CoreSettings
 from evopolicy_coordinator.core.isolation import occupancies
-from evopolicy_coordinator.core.leasing import expiry, fleet, queue
+from evopolicy_coordinator.core.leasing import fleet, queue
 from evopolicy_coordinator.core.runs import evaluations, finalisation, finished, journal, runs, submits
 from evopolicy_coordinator.core.status import Words
 from evopolicy_coordinator.core.tables import step
@@ -207,7 +207,7 @@ POLLS: Mapping[str, Rule] = {
 }
 
 TIMERS: dict[str, Rule] = {
-    "worker": expiry.check_due,
+    "worker": membership.check_due,
     "lease": fleet.poll_ended,
     "beat": fleet.beat_ended,
     "bench": scheduler.bench_ended,

@@ -1,4 +1,4 @@
-"""Leases: a worker's right to play a job, and what happens to the job when it ends. `expiry` decides when a lease
+"""Leases: a worker's right to play a job, and what happens to the job when it ends. `membership` decides when a lease
 expires.
 
 Rules that this module owns:

@@ -13,8 +13,8 @@ from evopolicy_common.messages import worker as wire
 from evopolicy_common.messages.episode import PolicyFailure
 from evopolicy_coordinator.core.contract import events
 from evopolicy_coordinator.core.contract.records import OutcomeRow, SubmitRow
-from evopolicy_coordinator.core.leasing.expiry import FORGET_S
 from evopolicy_coordinator.core.leasing.leases import lease_id
+from evopolicy_coordinator.core.workers.membership import FORGET_S
 
 GROUP = "r1/s0/train"
 

@@ -15,7 +15,7 @@ from rigs.core_rig import Rig, describe, fingerprint
 
 from evopolicy_common.messages import worker as wire
 from evopolicy_coordinator.core.leasing import fleet
-from evopolicy_coordinator.core.leasing.expiry import FORGET_S
+from evopolicy_coordinator.core.workers.membership import FORGET_S
 
 
 def join(rig: Rig, name: str, *, version: str = "1", machine: str = "", size: int = 0, **more: Any) -> Any:
