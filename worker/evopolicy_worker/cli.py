@@ -226,7 +226,7 @@ def default_name(own: credentials.Credentials) -> str:
     """
     certified = own.user.partition("/")[2]
     if not certified:
-        return host.new_worker_name()
+        return proc.new_worker_name()
     assert own.tls is not None
     # Never closed, so that the lock is held for the life of this process.
     fd = os.open(own.tls.certificate, os.O_RDONLY | os.O_CLOEXEC)

@@ -67,7 +67,7 @@ class RequestPermit(FromGateway, frozen=True, kw_only=True, tag="request_permit"
     lasts until the run is closed or cancelled, or an operator vouches that the agent has ended."""
 
     boot_id: Word
-    """Boot id of the agent's kernel (`host.boot_id`); empty: unknown, which counts as every kernel."""
+    """Boot id of the agent's kernel (`proc.boot_id`); empty: unknown, which counts as every kernel."""
     host: Word = ""
     """Name of that machine, for people."""
     wait_s: Number = 0.0

@@ -92,7 +92,7 @@ class Register(Message, frozen=True, kw_only=True, tag="register"):
     fingerprint: Fingerprint
     host: Word = ""
     boot_id: Word = ""
-    """Boot id of the worker's kernel (`host.boot_id`); without it a worker plays no hidden episodes."""
+    """Boot id of the worker's kernel (`proc.boot_id`); without it a worker plays no hidden episodes."""
     undescribed: Many[Word] = ()
     """Ids of shipped environments that it offers, too, and describes once a reply to a heartbeat asks for them."""
     installation: Word = ""
