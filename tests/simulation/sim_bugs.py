@@ -175,7 +175,7 @@ BUGS = (
         membership,
         "liveness_lost",
         "worker.doubted_at = step.now",
-        "__import__('evopolicy_coordinator.core.leasing.expiry', fromlist=['lose']).lose(state, worker, step)",
+        "__import__('evopolicy_coordinator.core.workers.membership', fromlist=['lose']).lose(state, worker, step)",
         seed=20,
     ),
     Bug(
