@@ -130,7 +130,7 @@ SIGNED_ANEW: dict[str, tuple[Edit, str, str]] = {
     "a replay, by its journal": (lambda f: f.entries(replay_entry), "commitment", "is a replay of run r-1"),
     "another place in the journal": (lambda f: f.json(RUN, put("committed", "opened_head", value="00" * 32)), "record", "another commitment or head"),
     "no place in the journal": (lambda f: f.json(RUN, put("committed", value=None)), "record", "another commitment or head"),
-    "recorded rewards edited": (lambda f: f.rerecord("heldout-001", lambda row: (row.action, 100.0)), "recordings", "rewards come to"),
+    "recorded rewards edited": (lambda f: f.rerecord("heldout-001", lambda row: (row.action, 100.0)), "recordings", "rewards sum to"),
     "a recording left out": (lambda f: f.files.__setitem__("runs/0000/actions/train-000", contents.pack_recordings([])), "recordings", "0 recordings"),
     "a recording that is none": (lambda f: f.files.__setitem__("runs/0000/actions/train-000", contents.pack_recordings([b"evotraj1", b"x"])), "recordings", "not a trajectory"),
     "a run's first entry cut off": (lambda f: f.entries(lambda lines: lines[1:]), "journal", "without being open"),
