@@ -6,7 +6,6 @@ import contextlib
 import os
 import platform
 import secrets
-import socket
 import subprocess
 from collections.abc import Collection
 from pathlib import Path
@@ -128,7 +127,7 @@ NO_BOOT_ID = f"the kernel does not show its boot id: mount /proc so that {_BOOT_
 
 def new_worker_name() -> str:
     """The host's name with a random suffix."""
-    return f"{socket.gethostname().split('.')[0][:40] or 'worker'}-{secrets.token_hex(3)}"
+    return f"{os.uname().nodename.split('.')[0][:40] or 'worker'}-{secrets.token_hex(3)}"
 
 
 def boot_id() -> str:

@@ -46,7 +46,7 @@ def state(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def test_the_docker_steps_make_the_folders_that_the_compose_file_mounts(state: Path, tmp_path: Path) -> None:
     machines = tmp_path / "machines"
     machines.mkdir(mode=0o700)
-    run_blocks("/machines", {"/machines": machines})
+    run_blocks("/machines/router", {"/machines": machines})
     services = yaml.safe_load((DEPLOY / "compose.yaml").read_text())["services"]
     for name in ("router", "worker"):
         (mount,) = services[name]["volumes"]

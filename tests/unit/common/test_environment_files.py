@@ -93,7 +93,7 @@ LONG = "x" * 2000
         ('title = "a\\nb"', "title 'a.*b': one line"),
         (f'success = "{LONG}"', "key of info 'xx.*one line of 120"),
         (f'reward_components = {{fuel = "{LONG}"}}', "text 'xx.*1,000 characters at most"),
-        ("task_file = 3", "task_file is 3: the name of a text file"),
+        ("task_file = 3", "task_file is 3: it has to name a text file"),
         ('family = "../x"', "family '../x': lowercase"),
         ('task_file = "none.md"', "task_file 'none.md' cannot be read"),
     ],

@@ -119,12 +119,13 @@ def verdicts(tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[int, s
         assert len(data) < 200_000
         (folder / str(number)).write_bytes(data)
     files = [str(folder / str(number)) for number in range(len(HOSTILE))]
-    ran = subprocess.run([sys.executable, "-c", DECODES, *files], capture_output=True, text=True, timeout=170)
+    ran = subprocess.run([sys.executable, "-c", DECODES, *files], capture_output=True, text=True, timeout=570)
     assert ran.stderr == ""
     lines = [line.split() for line in ran.stdout.splitlines()]
     return {number: (int(grown), verdict) for number, grown, verdict in lines}
 
 
+@pytest.mark.timeout(600)
 @pytest.mark.parametrize(("number", "name"), list(enumerate(HOSTILE)))
 def test_a_few_hostile_bytes_take_no_memory(
     number: int, name: str, verdicts: dict[str, tuple[int, str]]
