@@ -117,18 +117,6 @@ AGENT_LIMITS: dict[str, tuple[str, float, float]] = {
 }
 """Options `--agent-NAME`: the field of `AgentLimits`, the least value with which programs still start, the
 greatest."""
-OWN: dict[str, str] = {
-    "policy_scope": "episode",
-    "observations": "arrays",
-    "simulation": "forbidden",
-    "finish": "early",
-    "step_limit": "published",
-    "hidden_cases": "shared",
-    "feedback": "pictures",
-    "failed_episodes": "play-on",
-    "hidden_evaluation": "submit",
-}
-"""Defaults of settings that neither an option nor a profile gives."""
 
 
 class RunPart(msgspec.Struct, frozen=True, kw_only=True):
@@ -248,10 +236,10 @@ class RunOptions(PolicyPart, frozen=True, kw_only=True):
     ) -> RunSettings:
         """The settings of one run, `agent_host` as it has it. ConfigError naming the option that is wrong."""
         profile = self.profile or "own"
-        given = {name: getattr(self, name, None) for name in OWN}
+        given = {name: getattr(self, name, None) for name in PUBLISHED}
         given |= {"n_validation": self.validation, "n_heldout": self.heldout}
         given["hidden_cases"] = self.hidden_cases and self.hidden_cases.replace("-", "_")
-        usual: dict[str, Any] = dict(OWN)
+        usual: dict[str, Any] = {"step_limit": "published"}
         if profile != "own":
             usual = PUBLISHED | dict(zip(("n_validation", "n_heldout"), HIDDEN_COUNTS[profile], strict=True))
             for name, value in given.items():
@@ -260,11 +248,6 @@ class RunOptions(PolicyPart, frozen=True, kw_only=True):
                         f"profile {profile} has {name} = {usual[name]}, but {value} was given: drop one of them"
                     )
         chosen = usual | {name: value for name, value in given.items() if value is not None}
-        if chosen["feedback"] != "pictures" and self.video != "off":
-            raise ConfigError(
-                f"feedback {chosen['feedback']} shows no videos, and video {self.video} is asked for: leave out one of"
-                " them"
-            )
         chosen |= {name: getattr(self, name) for name in ("repeat", "budget", "video", "replays", "limits")}
         entry = self.entry or harnesses.entry_name(self.agent)
         settings = RunSettings(
@@ -282,6 +265,11 @@ class RunOptions(PolicyPart, frozen=True, kw_only=True):
             **chosen,
             **(texts or Texts()).digests,
         )
+        if settings.feedback != "pictures" and self.video != "off":
+            raise ConfigError(
+                f"feedback {settings.feedback} shows no videos, and video {self.video} is asked for: leave out one of"
+                " them"
+            )
         episode_counts(settings, catalogue.suite_of(env))
         return settings
 
