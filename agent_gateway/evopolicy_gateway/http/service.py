@@ -106,12 +106,7 @@ def make_app(pipeline: SubmitPipeline, token: str, bearer: str = "") -> ASGIApp:
             # The published service finalises a run by itself and answers this path with 405.
             Route("/finalize", finalize, methods=["GET", "POST"]),
         ],
-        exception_handlers={
-            HTTPException: _http_error,
-            RequestError: _request_error,
-            ClientDisconnect: lambda request, error: Response(status_code=400),
-            Exception: _our_error,
-        },
+        exception_handlers=dict.fromkeys((HTTPException, RequestError, ClientDisconnect, Exception), _failed),
     )
     app.router.redirect_slashes = False
     return _TokenGate(app, token, bearer)
@@ -153,41 +148,47 @@ async def _read_body(request: Request) -> bytes:
     return bytes(body)
 
 
-def _json(status: int, document: dict[str, Any], headers: dict[str, str] | None = None) -> Response:
+def _json(status: int, document: dict[str, Any], headers: Mapping[str, str] | None = None) -> Response:
     return Response(orjson.dumps(document), status, headers, "application/json")
 
 
-_STRANGER = _json(
-    401, {"error": {"message": "this service needs a bearer token"}}, {"WWW-Authenticate": "Bearer"}
+_CODES = {"conflict": 409, RUN_CLOSED: 409, CANCELLED: 409, "closed": 503, "gateway_failed": 500}
+"""HTTP status codes by the status of a refusal; 400 for others."""
+_ANSWERS = {
+    401: (None, "this service needs a bearer token"),
+    404: ("not_found", "unknown endpoint"),
+    405: ("method_not_allowed", "this URL does not take this method"),
+    500: (None, "the gateway failed; nothing was changed by this request"),
+}
+"""Status and message by HTTP status code."""
+_STRANGER = HTTPException(401, headers={"WWW-Authenticate": "Bearer"})
+_STOPPING = RequestError(
+    "closed",
+    "the gateway stops; accepted submits continue: send the request again, with the same Idempotency-Key",
 )
-_STOPS = "the gateway stops; accepted submits continue: send the request again, with the same Idempotency-Key"
-_STOPPING = _json(503, {"status": "closed", "error": {"message": _STOPS}})
 
 
-async def _request_error(request: Request, error: Exception) -> Response:
-    assert isinstance(error, RequestError)
-    document: dict[str, Any] = {"status": error.status, "error": {"message": error.message}}
+def _refusal(error: Exception) -> Response:
+    """The answer to a request that fails."""
+    status: str | None
+    if isinstance(error, RequestError):
+        code, status, message = _CODES.get(error.status, 400), error.status, error.message
+    else:
+        code = error.status_code if isinstance(error, HTTPException) else 500
+        status, message = _ANSWERS.get(code, ("bad_request", "the request cannot be served"))
+    document: dict[str, Any] = {} if status is None else {"status": status}
+    document["error"] = {"message": message}
     if isinstance(error, ConflictError):
-        return _json(409, document | {"submit_id": error.index})
-    codes = {RUN_CLOSED: 409, CANCELLED: 409, "closed": 503, "gateway_failed": 500}
-    return _json(codes.get(error.status, 400), document)
+        document["submit_id"] = error.index
+    return _json(code, document, getattr(error, "headers", None))
 
 
-async def _http_error(request: Request, error: Exception) -> Response:
-    assert isinstance(error, HTTPException)
-    answers = {
-        404: ("not_found", "unknown endpoint"),
-        405: ("method_not_allowed", "this URL does not take this method"),
-    }
-    status, message = answers.get(error.status_code, ("bad_request", "the request cannot be served"))
-    response = _json(error.status_code, {"status": status, "error": {"message": message}})
-    response.headers.update(error.headers or {})
-    return response
-
-
-async def _our_error(request: Request, error: Exception) -> Response:
-    log.error("request failed", path=request.url.path[-80:], exc_info=error)
-    return _json(500, {"error": {"message": "the gateway failed; nothing was changed by this request"}})
+async def _failed(request: Request, error: Exception) -> Response:
+    if isinstance(error, ClientDisconnect):
+        return Response(status_code=400)
+    if not isinstance(error, HTTPException | RequestError):
+        log.error("request failed", path=request.url.path[-80:], exc_info=error)
+    return _refusal(error)
 
 
 class _TokenGate:
@@ -203,7 +204,7 @@ class _TokenGate:
             return
         if self._bearer and not self._bears(scope):
             stranger = _Exchange(scope, receive, send, STRANGER_LINGER)
-            await _STRANGER(scope, stranger.receive, stranger.send)
+            await _refusal(_STRANGER)(scope, stranger.receive, stranger.send)
             return
         _, _, rest = scope["path"].partition("/")
         token, slash, path = rest.partition("/")
@@ -217,7 +218,7 @@ class _TokenGate:
             # The service stops while this request waits. The cancellation may end here: the server only waits for this
             # to return.
             if not exchange.answered:
-                await _STOPPING(scope, exchange.receive, exchange.send)
+                await _refusal(_STOPPING)(scope, exchange.receive, exchange.send)
 
     def _bears(self, scope: Scope) -> bool:
         """Whether the request carries the bearer token in exactly one header."""

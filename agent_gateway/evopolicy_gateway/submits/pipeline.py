@@ -29,7 +29,16 @@ from evopolicy_gateway.run_folder.layout import RunFolder
 from evopolicy_gateway.submits import snapshots
 from evopolicy_gateway.submits.coordinator_client import CoordinatorClient
 from evopolicy_gateway.submits.feedback import Collector, SubmitTree
-from evopolicy_gateway.submits.tickets import Do, Effect, Ticket, TicketMachine
+from evopolicy_gateway.submits.tickets import (
+    Collect,
+    Effect,
+    Note,
+    Send,
+    Stop,
+    TakeSnapshot,
+    Ticket,
+    TicketMachine,
+)
 
 log: structlog.stdlib.BoundLogger = structlog.get_logger()
 T = TypeVar("T")
@@ -140,29 +149,30 @@ class SubmitPipeline:
 
     def _go_on(self) -> None:
         if self.machine.in_flight is not None:
-            self._task = asyncio.create_task(self._carry_out(self.machine.in_flight))
+            self._task = asyncio.create_task(self._carry_out())
             self._changed()
 
-    async def _carry_out(self, ticket: Ticket) -> None:
+    async def _carry_out(self) -> None:
         started, effect = time.monotonic(), self.machine.next()
-        while effect is not None and not isinstance(effect, Exception):
-            effect = await self._perform(effect, ticket)
+        while effect is not None and not isinstance(effect, Stop):
+            effect = await self._perform(effect)
             self._changed()
         self.machine.in_flight_s += time.monotonic() - started
         if effect is not None:
-            self.fatal.set_exception(effect)
+            self.fatal.set_exception(effect.error)
 
     def _changed(self) -> None:
         self._news.set()
         self._news = asyncio.Event()
         self._on_change()
 
-    async def _perform(self, effect: Do | AnyEntry, ticket: Ticket) -> Effect | None:
+    async def _perform(self, effect: TakeSnapshot | Send | Collect | Note) -> Effect | None:
         """Performs an effect; returns the one that follows from its outcome."""
-        machine = self.machine
+        machine, ticket = self.machine, self.machine.in_flight
+        assert ticket is not None
         try:
             match effect:
-                case "snapshot":
+                case TakeSnapshot():
                     given = self.folder.system, self._blobs
                     published = machine.run.profile != "own"
                     snapshot = await self._on_disk(partial(snapshots.take, *given, published=published))
@@ -170,11 +180,11 @@ class SubmitPipeline:
                     return machine.snapshotted(
                         await asyncio.to_thread(snapshots.record_tree, snapshot, *more)
                     )
-                case "send":
+                case Send():
                     return machine.sent(await self._send(ticket.request, ticket.index))
-                case "collect":
+                case Collect():
                     return machine.collected(*await self._collect(ticket))
-                case entry:
+                case Note(entry):
                     following = machine.noted(entry, await self._note(entry))
                     if isinstance(entry, Accepted):
                         log.info("submit accepted", submit=ticket.submit_id, n_episodes=ticket.n_episodes)
@@ -245,10 +255,18 @@ class SubmitPipeline:
         """Writes the feedback; starts over when the disk refuses."""
         assert ticket.accepted is not None
         tree = SubmitTree(self.folder.feedback, ticket.submit_id)
-        known = (ticket, ticket.accepted, self._client, tree, self._journal.at_work, self._changed)
         while True:
+            collector = Collector(
+                machine=self.machine,
+                ticket=ticket,
+                accepted=ticket.accepted,
+                client=self._client,
+                tree=tree,
+                at_work=self._journal.at_work,
+                on_page=self._changed,
+            )
             try:
-                return await Collector(self.machine, *known).collect()
+                return await collector.collect()
             except (OSError, StorageError) as error:
                 # Without the error's paths: an agent reads this text.
                 why = error.strerror if isinstance(error, OSError) else None

@@ -6,14 +6,14 @@
 
 The pipeline performs one effect at a time and passes its outcome to the method that returns the next effect:
 
-| the ticket in flight | effect       | outcome                                                        |
-|----------------------|--------------|----------------------------------------------------------------|
-| is new               | "snapshot"   | `snapshotted`: the entry `Requested`                           |
-| is journalled        | "send"       | `sent`: the entry `Accepted`; `refused`: `Refused`, its end    |
-| is accepted          | "collect"    | `collected`: the entry `Settled`, its end                      |
-| has an entry         | the entry    | `noted`: the effect that its next state needs                  |
-| met an error         | entry `Died` | `noted`: the error, which ends the process. If that happens to |
-|                      |              | the next gateway too: the entry `SetAside`, its end            |
+| the ticket in flight | effect         | outcome                                                                     |
+|----------------------|----------------|-----------------------------------------------------------------------------|
+| is new               | `TakeSnapshot` | `snapshotted`: `Note` of the entry `Requested`                              |
+| is journalled        | `Send`         | `sent`: `Note` of `Accepted`; `refused`: `Note` of `Refused`, its end       |
+| is accepted          | `Collect`      | `collected`: `Note` of `Settled`, its end                                   |
+| has an entry         | `Note`         | `noted`: the effect that its next state needs                               |
+| met an error         | `Note`, `Died` | `noted`: `Stop`, which ends the process. If that happens to the next gateway |
+|                      |                | too: `Note` of `SetAside`, its end                                          |
 
 State that survives the process changes in `noted` alone, when its entry is durable.
 """
@@ -23,7 +23,6 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Mapping
-from typing import Literal
 
 import msgspec
 
@@ -53,11 +52,6 @@ class ConflictError(RequestError):
         super().__init__("conflict", message)
         self.index = index
         """Index of the earlier submit."""
-
-
-Do = Literal["snapshot", "send", "collect"]
-Effect = Do | AnyEntry | Exception
-"""A task for the ticket in flight, an entry to be journalled, or the error that ends the process."""
 
 
 class _SummaryPart(msgspec.Struct):
@@ -104,6 +98,33 @@ class Ticket(msgspec.Struct, kw_only=True, eq=False):
     def decided(self) -> bool:
         """Whether it is accepted, or certainly will not be."""
         return self.accepted is not None or self.done
+
+
+class TakeSnapshot(msgspec.Struct, frozen=True):
+    """Take a snapshot of `system/`."""
+
+
+class Send(msgspec.Struct, frozen=True):
+    """Send the submit to the coordinator."""
+
+
+class Collect(msgspec.Struct, frozen=True):
+    """Write its feedback, page by page."""
+
+
+class Note(msgspec.Struct, frozen=True):
+    """Append an entry to the journal."""
+
+    entry: AnyEntry
+
+
+class Stop(msgspec.Struct, frozen=True):
+    """End the process with this error."""
+
+    error: Exception
+
+
+Effect = TakeSnapshot | Send | Collect | Note | Stop
 
 
 class TicketMachine:
@@ -225,26 +246,27 @@ class TicketMachine:
         if self.in_flight is None:
             return None
         if self.in_flight.requested_at is None:
-            return "snapshot"
-        return "send" if self.in_flight.accepted is None else "collect"
+            return TakeSnapshot()
+        return Send() if self.in_flight.accepted is None else Collect()
 
-    def snapshotted(self, snapshot: Snapshot) -> Effect:
+    def snapshotted(self, snapshot: Snapshot) -> Note:
         more = {"bundle_error": snapshot.error, "kept": snapshot.kept, "tree": snapshot.tree}
-        return msgspec.structs.replace(self._open.request, bundle=snapshot.digest, **more)
+        return Note(msgspec.structs.replace(self._open.request, bundle=snapshot.digest, **more))
 
-    def sent(self, reply: messages.SubmitAccepted) -> Effect:
-        return open_run.Accepted(key=self._open.request.key, **msgspec.structs.asdict(reply))
+    def sent(self, reply: messages.SubmitAccepted) -> Note:
+        return Note(open_run.Accepted(key=self._open.request.key, **msgspec.structs.asdict(reply)))
 
     def paged(self, page: messages.ResultsPage, n_done: int, held_before: float) -> None:
         """A page is written, `n_done` episodes in all. `held_before`: `held_s` before the first page."""
         ticket, self.held_s = self._open, max(self.held_s, page.held_s)
         ticket.n_done, ticket.waits_for, ticket.held_s = n_done, page.waits_for, self.held_s - held_before
 
-    def collected(self, done: messages.SubmitDone, summary: bytes) -> Effect:
+    def collected(self, done: messages.SubmitDone, summary: bytes) -> Note:
         if done.status == CANCELLED:
             self.state = msgspec.structs.replace(self.state, remaining_budget=done.remaining_budget)
             self.close(cancelled=True)
-        return open_run.Settled(key=self._open.request.key, status=done.status, summary=summary.decode())
+        settled = open_run.Settled(key=self._open.request.key, status=done.status, summary=summary.decode())
+        return Note(settled)
 
     def refused(self, error: RefusedError) -> Effect | None:
         """The coordinator refused the submit, or to give its results."""
@@ -252,7 +274,7 @@ class TicketMachine:
         if over:
             self.close(cancelled=error.status == Refusal.RUN_CANCELLED)
         if self._open.accepted is None and (over or error.status in _REQUEST_STATUSES):
-            return open_run.Refused(key=request.key, status=error.status, message=error.message)
+            return Note(open_run.Refused(key=request.key, status=error.status, message=error.message))
         if not over:
             return self.failed(error)
         # Without an entry: if the coordinator opens the run once more, the next gateway collects the results.
@@ -261,9 +283,9 @@ class TicketMachine:
 
     def failed(self, error: Exception) -> Effect:
         if self._failure is not None:
-            return error
+            return Stop(error)
         self._failure = error
-        return open_run.Died(key=self._open.request.key)
+        return Note(open_run.Died(key=self._open.request.key))
 
     def noted(self, entry: AnyEntry, place: int) -> Effect | None:
         """The entry is durable at that offset of the journal; returns the next effect."""
@@ -304,10 +326,10 @@ class TicketMachine:
 
     def _after_death(self, ticket: Ticket, failure: Exception) -> Effect:
         if self.deaths[ticket.request.key, None] < MAX_DEATHS:
-            return failure
+            return Stop(failure)
         charged = "it was not accepted" if ticket.accepted is None else "its episodes are charged and count"
         text = f"the gateway failed {MAX_DEATHS} times on this submit and gives it no feedback; {charged}"
-        return open_run.SetAside(key=ticket.request.key, message=text)
+        return Note(open_run.SetAside(key=ticket.request.key, message=text))
 
     def _end(self, error: RequestError | None) -> None:
         """Ends the ticket in flight. Without acceptance it takes no index."""

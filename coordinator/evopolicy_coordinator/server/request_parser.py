@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import secrets
 from collections.abc import Callable
-from typing import Any, NamedTuple, get_args
+from typing import Any, NamedTuple, TypeVar, get_args
 
 import msgspec
 from msgspec.structs import replace
@@ -40,6 +40,7 @@ _DECODERS: dict[str, Any] = {
 }
 """By the first part of a key after the cluster's name."""
 
+P = TypeVar("P", gateway.ResultsRequest, operator.EvaluationPoll)
 _NO_REASON = "an override of a run's fingerprint class needs a reason"
 
 
@@ -144,12 +145,10 @@ class RequestParser:
             return self.runs.event(message, request, stimulus_id)
         if isinstance(message, worker.Register):
             return self._registered(message, request, stimulus_id)
-        if "cursor" in message.__struct_fields__:
-            message = replace(message, cursor=checks.finite_cursor(message.cursor))
-        if "wait_s" in message.__struct_fields__:
+        row = REQUESTS[type(message)]
+        if row.waits:
             message = replace(message, wait_s=checks.finite_wait(message.wait_s))
-        check = REQUESTS[type(message)].check
-        changed = None if check is None else check(self, message)
+        changed = None if row.check is None else row.check(self, message)
         return Requested(stimulus_id=stimulus_id, request=request, message=changed or message)
 
     def _registered(self, m: worker.Register, request: int, stimulus: str) -> AnyEvent:
@@ -197,9 +196,10 @@ class RequestParser:
         one = (m.bundle is None) != (m.bundle_error is None)
         require(one, Refusal.BAD_MESSAGE, "a submit has either a bundle or a bundle_error")
 
-    def _check_poll(self, m: gateway.ResultsRequest) -> None:
+    def _check_poll(self, m: gateway.ResultsRequest) -> gateway.ResultsRequest:
         index = m.submit_index
         require(0 <= index <= checks.MAX_COUNT, Refusal.UNKNOWN_SUBMIT, f"this run has no submit {index}")
+        return _bounded_cursor(m)
 
 
 class Request(NamedTuple):
@@ -211,26 +211,34 @@ class Request(NamedTuple):
     """Returns the message as the event has it, None if it stays as it is. Raises RefusedError."""
     creates: bool = False
     """Whether it would create something: a run, a submit, an evaluation."""
+    waits: bool = False
+    """Whether it has `wait_s`, which is bounded."""
+
+
+def _bounded_cursor(m: P) -> P:
+    return replace(m, cursor=checks.finite_cursor(m.cursor))
 
 
 REQUESTS: dict[type[Message], Request] = {
     **dict.fromkeys(get_args(operator.OperatorRequest), Request()),
     worker.Register: Request("register"),
-    worker.LeaseRequest: Request("lease"),
-    worker.Heartbeat: Request("beat"),
+    worker.LeaseRequest: Request("lease", waits=True),
+    worker.Heartbeat: Request("beat", waits=True),
     worker.ReportResults: Request("done", RequestParser._checked_results),
     BlobPut: Request("blob"),
     BlobGet: Request("blob"),
     gateway.OpenRun: Request("open"),
-    gateway.RequestPermit: Request("permit", lambda _, m: checks.check_place(m.boot_id, m.host)),
+    gateway.RequestPermit: Request("permit", lambda _, m: checks.check_place(m.boot_id, m.host), waits=True),
     gateway.StateRequest: Request("state"),
     gateway.Submit: Request("submit", RequestParser._check_submit, creates=True),
-    gateway.ResultsRequest: Request("results", RequestParser._check_poll),
+    gateway.ResultsRequest: Request("results", RequestParser._check_poll, waits=True),
     gateway.CloseRun: Request("close", lambda _, m: checks.bounded_close(m)),
     operator.CreateRun: Request(creates=True),
     operator.Evaluate: Request(creates=True),
     operator.Rescore: Request(creates=True),
     operator.Disclose: Request(creates=True),
+    operator.WaitRun: Request(waits=True),
+    operator.EvaluationPoll: Request(check=lambda _, m: _bounded_cursor(m), waits=True),
     operator.RepinRun: Request(
         check=lambda _, m: require(bool(m.reason.strip()), Refusal.BAD_MESSAGE, _NO_REASON)
     ),

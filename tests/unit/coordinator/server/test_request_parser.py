@@ -528,3 +528,10 @@ def test_a_lost_run_is_opened_again_as_the_same_run(tmp_path: Path) -> None:
     )
     asked = msgspec.structs.replace(create(), run=row.run)
     assert refused(make_parser(other), OPS, asked).status == "unknown_run"
+
+
+def test_the_wait_of_every_long_poll_is_bounded() -> None:
+    """Attack: a wait without end, in a kind of request whose row does not say that it waits."""
+    assert {kind for kind, row in REQUESTS.items() if row.waits} == {
+        kind for kind in REQUESTS if "wait_s" in kind.__struct_fields__
+    }

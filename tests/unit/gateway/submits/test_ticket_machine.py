@@ -29,7 +29,16 @@ from evopolicy_common.records.open_run import (
 from evopolicy_common.refusals import Refusal
 from evopolicy_gateway.submits import tickets
 from evopolicy_gateway.submits.snapshots import Snapshot
-from evopolicy_gateway.submits.tickets import ConflictError, Effect, Ticket, TicketMachine
+from evopolicy_gateway.submits.tickets import (
+    ConflictError,
+    Effect,
+    Note,
+    Send,
+    Stop,
+    TakeSnapshot,
+    Ticket,
+    TicketMachine,
+)
 
 BUDGET = 12
 BODIES = (b'{"env_instances": [1, 2]}', b'{"env_instances": [3]}', b'{"env_instances": [99]}')
@@ -95,12 +104,12 @@ class World:
         assert before is None
         assert not self.ends
         self.effect = self.machine.next()
-        assert self.effect == "snapshot"
+        assert self.effect == TakeSnapshot()
 
     def perform(self, outcome: str) -> None:
         """Performs the effect, or lets it fail."""
         effect, machine = self.effect, self.machine
-        if isinstance(effect, Exception):
+        if isinstance(effect, Stop):
             died = [entry.key for entry in self.journal if isinstance(entry, Died)]
             assert died.count(died[-1]) == 1
             self.start()
@@ -108,32 +117,32 @@ class World:
             self.start()
         elif effect is None:
             pass
-        elif isinstance(effect, str):
-            self.effect = self.fulfil(effect, outcome)
-            if outcome == "crash after":
-                self.start()
-        else:
-            self.journal.append(effect)
+        elif isinstance(effect, Note):
+            self.journal.append(effect.entry)
             if outcome == "crash after":
                 self.start()
             else:
-                self.effect = machine.noted(effect, len(self.journal) - 1)
+                self.effect = machine.noted(effect.entry, len(self.journal) - 1)
+        else:
+            self.effect = self.fulfil(effect, outcome)
+            if outcome == "crash after":
+                self.start()
 
-    def fulfil(self, task: str, outcome: str) -> Effect | None:
+    def fulfil(self, task: Effect, outcome: str) -> Effect | None:
         ticket, machine = self.machine.in_flight, self.machine
         assert ticket is not None
         if ticket.accepted is None and ticket.request.key in self.accepted:
             outcome = "ok"  # a repeated key gets its acceptance
         if outcome == "fail":
             return machine.failed(KeyError("a bug"))
-        if task == "snapshot":
+        if isinstance(task, TakeSnapshot):
             assert ticket.request not in self.journal
             return machine.snapshotted(Snapshot(digest=f"bundle-{ticket.request.key}", error=None))
         key = ticket.request.key
         assert ticket.request in self.journal
         assert self.sent.setdefault(key, ticket.request) == ticket.request
         assert ticket.request.bundle
-        if task == "send":
+        if isinstance(task, Send):
             assert ticket.accepted is None
             if outcome in REFUSALS:
                 self.ends |= outcome in ("end run", "cancel run")
