@@ -9,11 +9,12 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, TypeVar
 
 from evopolicy_common.messages import gateway, operator
 from evopolicy_common.messages import worker as wire
 from evopolicy_common.messages.status import StatusReply
+from evopolicy_common.messages.worker import Message
 from evopolicy_coordinator.core import loading, status
 from evopolicy_coordinator.core.agents import permits, precedence, requests
 from evopolicy_coordinator.core.contract import events
@@ -132,53 +133,69 @@ def drain(state: State, this: Step) -> None:
 # ---- the tables ----
 
 Rule = Callable[[State, Any, Step], None]
+M = TypeVar("M", bound=Message)
+T = TypeVar("T")
 
-EVENTS: dict[type, Rule] = {
-    operator.CreateRun: runs.create,
-    operator.WaitRun: finished.waited,
-    operator.CancelRun: finalisation.cancel,
-    operator.Disclose: journal.disclose,
-    operator.RepinRun: membership.repinned,
-    operator.Evaluate: evaluations.request,
-    operator.Rescore: evaluations.request,
-    operator.EvaluationPoll: evaluations.polled,
-    operator.SetWorker: membership.worker_state,
-    operator.AgentGone: requests.agent_gone,
-    gateway.OpenRun: runs.opened,
-    gateway.RequestPermit: requests.requested,
-    gateway.StateRequest: runs.state_requested,
-    gateway.Submit: submits.submit,
-    gateway.ResultsRequest: submits.results,
-    gateway.CloseRun: finalisation.close,
-    wire.Register: membership.registered,
-    wire.LeaseRequest: membership.lease_requested,
-    wire.Heartbeat: membership.heartbeat,
-    wire.ReportResults: membership.results_reported,
-    events.LivenessLost: membership.liveness_lost,
-    events.DescriptionAwaited: fleet.await_description,
-}
+
+def _request(message: type[M], rule: Callable[[State, events.Requested[M], Step], None]) -> tuple[type, Rule]:
+    """The rule for a request, which mypy compares with the type of its message."""
+    return message, rule
+
+
+def _event(key: type, event: type[T], rule: Callable[[State, T, Step], None]) -> tuple[type, Rule]:
+    """The rule for an event with fields of its own."""
+    return key, rule
+
+
+EVENTS: dict[type, Rule] = dict(
+    (
+        _event(operator.CreateRun, events.RunCreated, runs.create),
+        _request(operator.WaitRun, finished.waited),
+        _request(operator.CancelRun, finalisation.cancel),
+        _event(operator.Disclose, events.DisclosureRequested, journal.disclose),
+        _request(operator.RepinRun, membership.repinned),
+        _event(operator.Evaluate, events.EvaluationRequested, evaluations.request),
+        _event(operator.Rescore, events.EvaluationRequested, evaluations.request),
+        _request(operator.EvaluationPoll, evaluations.polled),
+        _request(operator.SetWorker, membership.worker_state),
+        _request(operator.AgentGone, requests.agent_gone),
+        _request(gateway.OpenRun, runs.opened),
+        _request(gateway.RequestPermit, requests.requested),
+        _request(gateway.StateRequest, runs.state_requested),
+        _request(gateway.Submit, submits.submit),
+        _request(gateway.ResultsRequest, submits.results),
+        _request(gateway.CloseRun, finalisation.close),
+        _event(wire.Register, events.WorkerRegistered, membership.registered),
+        _request(wire.LeaseRequest, membership.lease_requested),
+        _request(wire.Heartbeat, membership.heartbeat),
+        _request(wire.ReportResults, membership.results_reported),
+        _event(events.LivenessLost, events.LivenessLost, membership.liveness_lost),
+        _event(events.DescriptionAwaited, events.DescriptionAwaited, fleet.await_description),
+    )
+)
 """The rule for each event: by the message that it carries, or by its own type if it carries none."""
 
 
+def _news(
+    news: type[T], kinds: str, *rules: Callable[[State, T, Step], None]
+) -> dict[tuple[type, str], tuple[Rule, ...]]:
+    """The rules for a piece of news, of each of these kinds."""
+    return {(news, kind): rules for kind in kinds.split() or [""]}
+
+
 NEWS: dict[tuple[type, str], tuple[Rule, ...]] = {
-    (step.ResultsPersisted, ""): (results.take,),
-    (step.EpisodesDone, "train"): (runs.played, submits.progressed),
-    **{
-        (step.EpisodesDone, kind): (runs.played, finalisation.progressed)
-        for kind in ("validation", "heldout", "random")
-    },
-    (step.EpisodesDone, "evaluation"): (evaluations.progressed,),
-    **{
-        (step.EnvironmentFailed, kind): (finalisation.environment_failed,)
-        for kind in ("train", "validation", "heldout", "random")
-    },
-    (step.EnvironmentFailed, "evaluation"): (evaluations.environment_failed,),
-    (step.SubmitEnded, ""): (finalisation.submit_ended,),
-    (step.AgentOverdue, ""): (finalisation.agent_overdue,),
-    (step.FlowPinned, "run"): (runs.pinned,),
-    (step.FlowPinned, "evaluation"): (evaluations.pinned,),
-    (step.JobRetried, ""): (runs.retried,),
-    (step.ResultsDiffered, ""): (runs.differed,),
+    **_news(step.ResultsPersisted, "", results.take),
+    **_news(step.EpisodesDone, "train", runs.played, submits.progressed),
+    **_news(step.EpisodesDone, "validation heldout random", runs.played, finalisation.progressed),
+    **_news(step.EpisodesDone, "evaluation", evaluations.progressed),
+    **_news(step.EnvironmentFailed, "train validation heldout random", finalisation.environment_failed),
+    **_news(step.EnvironmentFailed, "evaluation", evaluations.environment_failed),
+    **_news(step.SubmitEnded, "", finalisation.submit_ended),
+    **_news(step.AgentOverdue, "", finalisation.agent_overdue),
+    **_news(step.FlowPinned, "run", runs.pinned),
+    **_news(step.FlowPinned, "evaluation", evaluations.pinned),
+    **_news(step.JobRetried, "", runs.retried),
+    **_news(step.ResultsDiffered, "", runs.differed),
 }
 """The rules for each piece of news: by its type and, where it has one, its `kind`."""
 
