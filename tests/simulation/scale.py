@@ -131,7 +131,13 @@ class Load:
             validation=tuple(Case(seed=900 + seed) for seed in range(16)),
             heldout=tuple(Case(seed=950 + seed) for seed in range(32)),
             split_hashes={},
-            split_secret=True,
+            cases_secret=True,
+            policy_seeds="",
+            epoch="",
+            salt=b"",
+            max_steps=0,
+            allowed_imports=(),
+            denied_imports=(),
         )
         self._ask(gateway.RequestPermit, run=run, boot_id=f"agent-of-{run}")
         self._submit(run)

@@ -53,7 +53,13 @@ class SimOperator(Asker):
             "min_episodes_per_submit": 1,
             "max_episodes_per_submit": plan.budget,
             "split_hashes": {},
-            "split_secret": True,
+            "cases_secret": True,
+            "policy_seeds": "",
+            "epoch": "",
+            "salt": b"",
+            "max_steps": 0,
+            "allowed_imports": (),
+            "denied_imports": (),
             **cases,
         }
         self.ask(operator.CreateRun, fields, self._created)

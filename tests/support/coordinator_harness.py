@@ -361,7 +361,7 @@ async def working(
 def comparable(finished: RunFinished) -> dict[str, Any]:
     """The part of a result that must not depend on restarts and retries: all but times and counts of retries."""
     plain: dict[str, Any] = msgspec.to_builtins(finished)
-    own = ("run", "committed", "created_at", "closed_at", "finished_at", "wall_s", "infrastructure_retries")
+    own = ("run", "committed", "created_at", "finished_at", "wall_s", "infrastructure_retries")
     for name in own:
         del plain[name]
     for submit in plain["submits"]:

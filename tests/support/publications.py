@@ -13,6 +13,7 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from cryptography.hazmat.primitives.serialization import Encoding, PublicFormat
 
 from evopolicy_common.errors import ProtocolError
+from evopolicy_common.messages.operator import RunResult
 from evopolicy_common.records import journal
 from evopolicy_common.records.aggregates import mean, std
 from evopolicy_common.records.episodes.trajectory import Recorder, decode
@@ -215,7 +216,7 @@ class Forger:
                 cards.Source(
                     name[:9],
                     decode_run_record(data),
-                    msgspec.json.decode(self.files[f"{name[:9]}/{contents.RESULT}"], type=journal.Result),
+                    msgspec.json.decode(self.files[f"{name[:9]}/{contents.RESULT}"], type=RunResult),
                 )
                 for name, data in sorted(self.files.items())
                 if name.endswith(f"/{contents.RUN}")

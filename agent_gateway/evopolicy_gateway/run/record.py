@@ -14,7 +14,7 @@ import asyncio
 import contextlib
 import os
 import traceback
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
@@ -22,19 +22,16 @@ from typing import Any, cast, get_args
 
 import msgspec
 
-from evopolicy_common import catalogue
 from evopolicy_common.errors import ConfigError, EvopolicyError, StorageError, TransportError
-from evopolicy_common.messages.environment import Split
-from evopolicy_common.messages.gateway import CANCELLED
-from evopolicy_common.messages.operator import RunFinished, SubmitRecord
+from evopolicy_common.messages import gateway
+from evopolicy_common.messages.operator import RunFinished, SubmitResult
 from evopolicy_common.processes.preflight import foreseen
 from evopolicy_common.processes.scratch import remove_tree
-from evopolicy_common.records import model_record
+from evopolicy_common.records import account, model_record
 from evopolicy_common.records import run_record as schema
-from evopolicy_common.records.aggregates import mean, std
+from evopolicy_common.records.account import Claims
 from evopolicy_common.records.blobs import BlobStore, write_atomically
-from evopolicy_common.records.code_metrics import TREND, CodeMetrics
-from evopolicy_common.records.journal import GATEWAY_SIDE
+from evopolicy_common.records.code_metrics import CodeMetrics
 from evopolicy_common.records.open_run import Accepted, Rejected, Requested
 from evopolicy_common.records.policies import bundles, checkpoints
 from evopolicy_common.records.policies.bundles import Bundle
@@ -54,18 +51,6 @@ from evopolicy_gateway.submits.feedback import count_transitions
 
 _RESUMABLE = (OSError, StorageError, TransportError, ConfigError)
 """Errors with a remedy, after which `--resume` writes everything."""
-
-
-_SAME_DIMENSIONS = (
-    *("policy_scope", "observations", "simulation", "video", "limits", "finish", "feedback", "step_limit"),
-    *("failed_episodes", "hidden_evaluation", "profile", "hidden_cases"),
-)
-"""Settings that `run.json` records as its experiment's dimensions, under the same names."""
-_SAME_BOUNDS = ("n_train", "min_episodes_per_submit", "max_episodes_per_submit")
-"""Fields of `Staged` that are dimensions too."""
-_SAME_SETTINGS = ("model", "env", "exp_id", "repeat", "attempt", "sandbox_tier")
-_SAME_RESULTS = ("env_title", "env_family", "run", "hidden_isolation", "committed")
-"""Fields of the settings and of the finished run that `run.json` has under the same names."""
 
 
 @contextlib.contextmanager
@@ -91,8 +76,13 @@ def why_failed(error: Exception, log: Path) -> str:
     return why
 
 
+_NO_TIMES = Times()
 INTERRUPTED = "interrupted by you (Ctrl-C or SIGTERM)"
 """The error of a run that its command gave up for that reason."""
+CANCELLED = (
+    "cancelled by the operator, or because other runs waited for its agent"
+    " (the coordinator's log: run_cancelled)"
+)
 
 
 async def write(
@@ -119,7 +109,7 @@ async def write(
         rejected, kept = await asyncio.to_thread(_from_journal, folder)
     for submit in finished.submits:
         code[submit.submit_index] = None
-        name = submit_id(submit.submit_index, finished.episode_budget)
+        name = submit_id(submit.submit_index, finished.budget)
         with optional(f"checkpoint {name}"):
             digest = submit.bundle or kept.get(submit.submit_index)
             bundle = await asyncio.to_thread(_own_bundle, folder, digest)
@@ -137,10 +127,10 @@ async def write(
         with optional("the selected policy in workspace/system"):
             files = checkpoints.without_metadata(selected.files)
             await asyncio.to_thread(_put_in_place, folder.system, files)
-    if error is not None and finished.status == "cancelled":
-        status = "cancelled" if error == INTERRUPTED else "error"
-        finished = msgspec.structs.replace(finished, status=status, error=error)
-    known: dict[str, Any] = {"code": code}
+    known: dict[str, Any] = {"code": code, "error": finished.error}
+    if finished.status == "cancelled":
+        known["gave_up"] = error not in (None, INTERRUPTED)
+        known["error"] = error or finished.error or CANCELLED
     with optional("the recordings of held-out episodes"):
         known["replays"] = await replays.fetch(folder.root, finished, operations)
 
@@ -158,8 +148,8 @@ async def write(
         facts = finished.agent
         with optional("the agent's use of its model"):
             facts = _complete(folder, plan, facts)
-        whole = msgspec.structs.replace(finished, agent=facts)
-        done = run_record(plan, whole, staged, rejected, times, **known, artifacts=folder.artifacts())
+        known["artifacts"] = folder.artifacts()
+        done = account.run_record(finished, claims(plan, facts, staged, rejected, times, **known))
         write_atomically(folder.run_json, encode_run_record(done))
         # A later command removes the rest.
         with contextlib.suppress(OSError):
@@ -172,45 +162,28 @@ async def write(
     return done
 
 
-def run_record(
+def claims(
     plan: Plan,
-    finished: RunFinished,
-    staged: Staged | None,
-    rejected: Sequence[Rejected],
-    times: Times,
-    *,
-    code: Mapping[int, CodeMetrics | None] | None = None,
-    transitions: dict[str, int] | None = None,
+    facts: dict[str, Any],
+    staged: Staged | None = None,
+    rejected: Sequence[Rejected] = (),
+    times: Times = _NO_TIMES,
     **more: Any,
-) -> RunRecord:
-    """The record of a finished run; pure. `staged` None: no workspace. `code`: by submit."""
-    settings = finished.settings
-    suite = catalogue.suite_of(settings.env)
-    dimensions = {name: getattr(settings, name) for name in _SAME_DIMENSIONS}
-    dimensions |= {name: getattr(staged, name, 0) for name in _SAME_BOUNDS}
-    spent = {f"{name}_s": finished.wall_s.get(name, 0.0) for name in ("queue", "rollout", "finalise")}
-    spent |= {name: getattr(times, name) for name in ("feedback_s", "held_s", "permit_s")}
-    spent["agent_s"] = max(0.0, times.open_s - times.in_flight_s)
-    spent["wall_time_seconds"] = finished.finished_at - finished.created_at
-    same = {name: getattr(settings, name) for name in _SAME_SETTINGS}
-    same |= {name: getattr(finished, name) for name in _SAME_RESULTS}
-    n_heldout = len(finished.heldout_returns or finished.random_heldout_returns)
-    return RunRecord(
-        agent=_agent(plan, finished.agent, times),
+) -> Claims:
+    """What this side knows of a run; pure. `facts`: about the agent. `staged` None: no workspace. `more`: of
+    `Claims`."""
+    if staged is not None:
+        more["agents_md_hash"] = sha256_text(staged.agents_md_file_hash)
+        more["rules_hash"] = sha256_text(staged.agents_md_hash)
+        more["initial_policy_hash"] = sha256_text(staged.initial_policy_hash)
+    return Claims(
+        agent=_agent(plan, facts, times),
         jail=plan.jail.recorded,
-        experiment_dimensions=schema.ExperimentDimensions(
-            episode_budget=finished.episode_budget,
-            n_validation=settings.n_validation or suite.n_validation,
-            n_heldout=n_heldout or settings.n_heldout or suite.n_heldout,
-            agents_md=sha256_text(settings.agents_md),
-            **dimensions,
-        ),
-        timing=schema.Timing(
-            start_time=utc_text(finished.created_at),
-            end_time=utc_text(finished.finished_at),
-            **{name: round(seconds, 3) for name, seconds in spent.items()},
-        ),
-        outcome=_outcome(finished, code or {}, transitions),
+        harness=f"evopolicy {version('evopolicy')}",
+        agent_s=max(0.0, times.open_s - times.in_flight_s),
+        feedback_s=times.feedback_s,
+        held_s=times.held_s,
+        permit_s=times.permit_s,
         rejected_submits=tuple(
             schema.RejectedSubmit(
                 status=cast(schema.RejectedStatus, one.status),
@@ -221,34 +194,20 @@ def run_record(
             for one in rejected
             if one.status in get_args(schema.RejectedStatus)
         ),
-        versions=_versions(finished, staged),
-        start=settings.start or plan.settings.start,  # an older coordinator keeps none
-        replay_of=plan.settings.replay_of,
-        trees={str(submit.submit_index): submit.tree for submit in finished.submits if submit.tree},
-        **same,
         **more,
     )
 
 
 def told_at_close(folder: RunFolder, plan: Plan, facts: dict[str, Any], times: Times) -> dict[str, Any]:
-    """The `GATEWAY_SIDE` of `run.json`, which the coordinator commits to when the run ends."""
-    agent = msgspec.to_builtins(_agent(plan, _complete(folder, plan, facts), times))
-    settings = {name: value for name, value in agent["settings"].items() if name in schema.PUBLISHED_SETTINGS}
-    told = {f"agent.{name}": value for name, value in agent.items()}
-    told |= {"jail": plan.jail.recorded, "agent.settings": settings}
-    if folder.staged.exists():
-        hashes = _workspace_hashes(saved(folder.staged, Staged))
-        told |= {f"versions.{name}": value for name, value in hashes.items()}
-    return {name: told[name] for name in GATEWAY_SIDE if name in told}
-
-
-def _workspace_hashes(staged: Staged) -> dict[str, Any]:
-    """The hashes of a staged workspace, by their names in `versions`."""
-    return {
-        "agents_md_hash": sha256_text(staged.agents_md_file_hash),
-        "rules_hash": sha256_text(staged.agents_md_hash),
-        "initial_policy_hash": sha256_text(staged.initial_policy_hash),
+    """The `Told` of `run.json`, as it is published: the coordinator commits to it when the run ends."""
+    staged = saved(folder.staged, Staged) if folder.staged.exists() else None
+    known = claims(plan, _complete(folder, plan, facts), staged, times=times)
+    settings = {
+        name: each for name, each in known.agent.settings.items() if name in schema.PUBLISHED_SETTINGS
     }
+    told = {name: getattr(known, name) for name in account.Told.__struct_fields__}
+    told["agent"] = msgspec.structs.replace(known.agent, settings=settings)
+    return cast(dict[str, Any], msgspec.to_builtins(told))
 
 
 def _complete(folder: RunFolder, plan: Plan, facts: dict[str, Any]) -> dict[str, Any]:
@@ -301,7 +260,6 @@ def _agent(plan: Plan, facts: dict[str, Any], times: Times) -> schema.Agent:
         own["jail"] = jail
     return schema.Agent(
         entry=plan.settings.entry,
-        prompts=sha256_text(plan.settings.prompts),
         inputs=plan.texts.inputs,
         harness=facts.get("harness") or plan.agent.partition(":")[0],
         settings=without_keys(own | facts.get("settings", {})),
@@ -309,81 +267,9 @@ def _agent(plan: Plan, facts: dict[str, Any], times: Times) -> schema.Agent:
         resources=times.resources,
         retries=int(facts.get("retries", 0)),
         turns=int(facts.get("turns", 0)),
-        **{name: facts.get(name) for name in ("cli_version", "model_string", "model_use")},
-    )
-
-
-def _outcome(
-    finished: RunFinished, code: Mapping[int, CodeMetrics | None], transitions: dict[str, int] | None
-) -> schema.Outcome:
-    heldout, reference = finished.heldout_returns, finished.random_heldout_returns
-    error = finished.error
-    if finished.status == "cancelled" and error is None:
-        error = "cancelled by the operator, or because other runs waited for its agent"
-        error += " (the coordinator's log: run_cancelled)"
-    best = finished.best_submit_index if finished.status == "completed" else None
-    auxiliary: dict[str, Any] = {
-        "code_metrics_best": None if best is None else code.get(best),
-        "code_metrics_by_submit": {str(index): metrics for index, metrics in code.items()},
-        "code_metrics_trend": {
-            "submits": list(code),
-            **{name: [getattr(metrics, name, None) for metrics in code.values()] for name in TREND},
-        },
-        "policy_failures": dict(finished.policy_failures),
-        "infrastructure_retries": finished.infrastructure_retries,
-        "nondeterministic_results": finished.nondeterministic_results,
-    }
-    if transitions is not None:
-        auxiliary["transitions"] = transitions
-    random = None
-    if reference:
-        random = schema.ReferenceScore(
-            mean_return=mean(reference),
-            std_return=std(reference),
-            returns=reference,
-            seeded_by="case",
-        )
-    # As published: a run without an ok submit has the score 0.0.
-    scored: dict[str, Any] = {"final_score": 0.0} if finished.status == "no_ok_submit" else {}
-    if finished.status == "completed":
-        scored = {
-            "final_score": finished.final_score,
-            "best_submit_index": best,
-            "val_scores": {str(index): mean for index, mean in finished.val_scores.items()},
-            "heldout_mean_return": finished.final_score,
-            "heldout_std_return": std(heldout) if heldout else None,
-            "heldout_returns": heldout,
-            "heldout_successes": finished.heldout_successes,
-        }
-    return schema.Outcome(
-        **scored,
-        status=finished.status,
-        error=error,
-        quarantined_submits=tuple(sorted(finished.validation_ineligible)),
-        random_reference=random,
-        closed_reason=finished.closed_reason,
-        budget_used=finished.budget_used,
-        auxiliary=auxiliary,
-    )
-
-
-def _versions(finished: RunFinished, staged: Staged | None) -> schema.Versions:
-    fingerprint = finished.fingerprint
-    hashes = {name: sha256_text(digest) for name, digest in finished.split_hashes.items()}
-    cases: dict[Split, str] = {split: hashes.get(split, "") for split in ("train", "validation", "heldout")}
-    return schema.Versions(
-        harness=f"evopolicy {version('evopolicy')}",
-        env=finished.env_version,
-        data_train_hash=hashes.get("train.json", cases["train"]),
-        data_valid_hash=hashes.get("valid.json", cases["validation"]),
-        data_heldout_hash=hashes.get("heldout.json", cases["heldout"]),
-        cases_hashes=cases,
-        fingerprint={} if fingerprint is None else fingerprint.flat(),
-        fingerprint_overrides=finished.fingerprint_overrides,
-        installations=finished.installations,
-        data_secret=finished.split_secret,
-        env_deterministic=finished.deterministic,
-        **({"agents_md_hash": ""} if staged is None else _workspace_hashes(staged)),
+        cli_version=facts.get("cli_version"),
+        model_string=facts.get("model_string"),
+        model_use=facts.get("model_use"),
     )
 
 
@@ -407,9 +293,9 @@ def _from_journal(folder: RunFolder) -> tuple[list[Rejected], dict[int, str | No
     return rejected, {entry.submit_index: kept.get(entry.key) for entry in accepted}
 
 
-def _meta(submit: SubmitRecord) -> CheckpointMeta:
+def _meta(submit: SubmitResult) -> CheckpointMeta:
     requested = len(submit.env_instances)
-    charged = 0 if submit.status == CANCELLED else requested
+    charged = 0 if submit.status == gateway.CANCELLED else requested
     return CheckpointMeta(
         submit_index=submit.submit_index,
         submit_time=utc_text(submit.started_at),
@@ -434,8 +320,7 @@ def _env_log(finished: RunFinished) -> bytes:
         events.append(("train", {"submit_index": submit.submit_index, **times, **played}))
     for index, score in finished.val_scores.items():
         events.append(("validation", {"submit_index": index, "mean_return": score}))
-    for index, why in finished.validation_ineligible.items():
-        events.append(("not_eligible", {"submit_index": index, "reason": why}))
+    events += [("not_eligible", {"submit_index": index}) for index in finished.validation_ineligible]
     if finished.heldout_returns:
         events.append(("heldout", {"submit_index": best, "returns": finished.heldout_returns}))
     if finished.random_heldout_returns:

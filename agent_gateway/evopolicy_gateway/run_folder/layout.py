@@ -132,7 +132,7 @@ class RunFolder(msgspec.Struct, frozen=True):
     start = Place(f"{open_run.STATE}/start.json")
     """`Start` of a run whose workspace is that of an earlier submit."""
     staged = Place(f"{open_run.STATE}/staged.json")
-    """Hashes and bounds of the staged workspace: `Staged`."""
+    """Hashes of the staged workspace: `Staged`."""
 
 
 class Staged(msgspec.Struct, frozen=True, kw_only=True):
@@ -144,10 +144,6 @@ class Staged(msgspec.Struct, frozen=True, kw_only=True):
     """Of `AGENTS.md`; empty in a workspace of an earlier version."""
     initial_policy_hash: str
     """Of `system/policy.py`."""
-    n_train: int
-    """Number of train cases."""
-    min_episodes_per_submit: int
-    max_episodes_per_submit: int
 
 
 def entry_folder(entry: str) -> str:

@@ -44,9 +44,6 @@ def stage(folder: RunFolder, run: RunOpened, urls: Urls, text: str = "") -> Stag
         agents_md_hash=digest_of(agents_md(run, NO_URLS, text, started=started).encode()),
         agents_md_file_hash=digest_of(rules),
         initial_policy_hash=digest_of(policy),
-        n_train=run.n_env_instances,
-        min_episodes_per_submit=run.min_episodes_per_submit,
-        max_episodes_per_submit=run.max_episodes_per_submit,
     )
     save(folder.staged, staged)
     return staged

@@ -47,6 +47,26 @@ Profile = Literal["own", "published", "published-data"]
 cases in the paper, `published-data` with that of the published case files."""
 
 
+class Conditions(msgspec.Struct, frozen=True, kw_only=True):
+    """Settings that define the experiment besides agent and environment: a run is opened with them, its gateway gets
+    them, and `run.json` has them among its dimensions. Runs that differ here are not comparable."""
+
+    policy_scope: PolicyScope = "episode"
+    observations: ObservationForm = "arrays"
+    video: VideoOption = "off"
+    simulation: SimulationRule = "forbidden"
+    finish: FinishRule = "early"
+    failed_episodes: FailedEpisodes = "play-on"
+    """After a failure of the policy, random actions play the episode (`play-on`), or the submit has no mean return and
+    its checkpoint is not eligible (`end-submit`)."""
+    hidden_evaluation: HiddenEvaluation = "submit"
+    """Arguments of a policy on hidden cases: those of its own submit, or those of one list of all cases (`pool`)."""
+    profile: Profile = "own"
+    """`published`: all choices of the published protocol together, including its public case files."""
+    feedback: FeedbackDetail = "pictures"
+    """The agent's feedback level."""
+
+
 class FromGateway(Message, frozen=True, kw_only=True):
     """A request of a run's gateway."""
 
@@ -113,7 +133,7 @@ class RunState(msgspec.Struct, frozen=True, kw_only=True):
     """Sum of `SubmitInFlight.held_s` over the run's submits so far, seconds."""
 
 
-class RunOpened(Message, frozen=True, kw_only=True, tag="run_opened"):
+class RunOpened(Message, Conditions, frozen=True, kw_only=True, tag="run_opened"):
     """The run's fixed settings, and its current state."""
 
     env: EnvironmentDescription
@@ -122,20 +142,11 @@ class RunOpened(Message, frozen=True, kw_only=True, tag="run_opened"):
     episode_budget: Int
     min_episodes_per_submit: Int
     max_episodes_per_submit: Int
-    policy_scope: PolicyScope
-    observations: ObservationForm
     sandbox_tier: Tier
-    video: VideoOption
     limits: ResourceLimits
     allowed_imports: Many[Text]
     denied_imports: Many[Text]
     state: RunState
-    simulation: SimulationRule = "forbidden"
-    finish: FinishRule = "early"
-    feedback: FeedbackDetail = "pictures"
-    failed_episodes: FailedEpisodes = "play-on"
-    hidden_evaluation: HiddenEvaluation = "submit"
-    profile: Profile = "own"
     max_steps: Int = 0
     """Steps after which an episode is cut, reported to agents as the limit; 0: the environment's own limit."""
 

@@ -6,7 +6,7 @@ from typing import Literal
 
 import msgspec
 
-from evopolicy_common.messages.bounds import Bytes, Int, Many, Named, Number, Numbered, Plain, Text, Word
+from evopolicy_common.messages.bounds import Bytes, Int, Many, Named, Number, Plain, Text, Word
 from evopolicy_common.messages.environment import (
     Case,
     EnvironmentDescription,
@@ -73,65 +73,16 @@ class Committed(msgspec.Struct, frozen=True, kw_only=True):
     """Hash (hex) of the journal up to that entry."""
 
 
-class RunFinished(msgspec.Struct, frozen=True, kw_only=True):
-    """A finalised run as stored by the coordinator: the source of `run.json`."""
-
-    run: Word
-    settings: RunSettings
-    status: RunEnd
-    error: Text | None
-    closed_reason: Text = msgspec.field(name="close_reason")
-    agent: Plain
-    final_score: Number | None
-    """Held-out mean return of the selected checkpoint."""
-    best_submit_index: Int | None
-    val_scores: Numbered[Number]
-    heldout_returns: Many[Number]
-    validation_ineligible: Numbered[Text]
-    """`ok` checkpoints that cannot be selected, with the reason."""
-    policy_failures: Named[Int]
-    """Hidden episodes in which the selected policy failed, by split."""
-    random_heldout_returns: Many[Number]
-    """Returns of uniform random actions on the same held-out cases."""
-    episode_budget: Int
-    budget_used: Int
-    split_hashes: Named[Text]
-    """SHA-256 of each split, by its name."""
-    split_secret: bool
-    env_version: Word
-    deterministic: bool
-    env_title: Word = ""
-    env_family: Word = ""
-    """Title and family as the environment's definition states them; empty: the catalogue's."""
-    fingerprint: Fingerprint | None
-    """Fingerprint of the worker to which the run was pinned."""
-    created_at: Number
-    closed_at: Number
-    finished_at: Number
-    submits: Many[SubmitRecord]
-    wall_s: Named[Number]
-    """Seconds by phase: `queue`, `rollout`, `finalise`."""
-    infrastructure_retries: Int = 0
-    nondeterministic_results: Int = 0
-    """Repeated attempts of a job whose results differed."""
-    hidden_isolation: HiddenIsolation = "unknown"
-    fingerprint_overrides: Many[Text] = ()
-    """`CLASS → CLASS: why` for each time an operator let the run continue with other versions, oldest first."""
-    committed: Committed | None = None
-    heldout_successes: Many[bool] = ()
-    """Whether each held-out episode solved the task; empty where the environment does not report it."""
-    installations: Many[Word] = ()
-    """Installations of the workers that played its episodes, in the order of their first ones."""
-
-
-class SubmitRecord(msgspec.Struct, frozen=True, kw_only=True):
-    """One accepted submit, as checkpoints and `metrics.json` need it."""
+class SubmitResult(msgspec.Struct, frozen=True, kw_only=True):
+    """The result of one accepted submit."""
 
     submit_index: Int
     status: SubmitStatus
     bundle: Word | None
+    """SHA-256 (hex) of the policy's bundle."""
     env_instances: Many[Int]
     remaining_budget: Int
+    """After this submit."""
     mean_return: Number | None
     """Mean return over the train episodes, visible to the agent; None unless ok."""
     val_mean: Number | None
@@ -139,6 +90,80 @@ class SubmitRecord(msgspec.Struct, frozen=True, kw_only=True):
     completed_at: Number
     tree: Word = ""
     """Digest of the workspace at the submit; empty: not recorded."""
+
+
+class RunResult(msgspec.Struct, frozen=True, kw_only=True):
+    """The result of a run: the document that the journal's last entry on the run commits to, published as it is."""
+
+    run: Word
+    status: RunEnd
+    closed_reason: Text
+    best_submit_index: Int | None
+    final_score: Number | None
+    """Held-out mean return of the selected checkpoint."""
+    heldout_returns: Many[Number]
+    heldout_successes: Many[bool]
+    """Whether each held-out episode solved the task; empty where the environment does not report it."""
+    random_heldout_returns: Many[Number]
+    """Returns of uniform random actions on the same held-out cases."""
+    validation_ineligible: Many[Int]
+    """`ok` checkpoints that cannot be selected, since their policy failed in validation."""
+    policy_failures: Named[Int]
+    """Hidden episodes in which the selected policy failed, by split."""
+    budget_used: Int
+    submits: Many[SubmitResult]
+    infrastructure_retries: Int
+    nondeterministic_results: Int
+    """Repeated attempts of a job whose results differed."""
+    split_hashes: Named[Text]
+    """SHA-256 of each split, and of each case file, by name."""
+    env_title: Word
+    env_family: Word
+    """Title and family as the environment's definition states them; empty: the catalogue's."""
+    env_version: Word
+    deterministic: bool
+    fingerprint: Fingerprint | None
+    """Fingerprint of the worker to which the run was pinned."""
+    installations: Many[Word]
+    """Installations of the workers that played its episodes, in the order of their first ones."""
+    n_overrides: Int
+    """How often an operator let the run continue with other versions."""
+    hidden_isolation: HiddenIsolation
+    wall_s: Named[Number]
+    """Seconds by phase: `queue`, `rollout`, `finalise`."""
+    record: Plain
+    """What the gateway told when it closed the run (`account.Told`); empty: nothing."""
+
+    @property
+    def val_scores(self) -> dict[int, float]:
+        """Validation means of the eligible checkpoints, by submit."""
+        return {one.submit_index: one.val_mean for one in self.submits if one.val_mean is not None}
+
+
+class RunFinished(RunResult, frozen=True, kw_only=True):
+    """A finalised run as stored by the coordinator: the source of `run.json`."""
+
+    settings: RunSettings
+    error: Text | None
+    agent: Plain
+    """The gateway's facts about the agent."""
+    fingerprint_overrides: Many[Text]
+    """`CLASS → CLASS: why` for each time an operator let the run continue with other versions, oldest first."""
+    budget: Int
+    min_episodes_per_submit: Int
+    max_episodes_per_submit: Int
+    n_train: Int
+    n_validation: Int
+    n_heldout: Int
+    cases_secret: bool
+    created_at: Number
+    finished_at: Number
+    committed: Committed
+
+    @property
+    def result(self) -> RunResult:
+        """The part that is committed to and published: without an operator's words and the agent's other facts."""
+        return RunResult(**{name: getattr(self, name) for name in RunResult.__struct_fields__})
 
 
 class WaitRun(FromOperator, frozen=True, kw_only=True, tag="wait_run"):
@@ -232,7 +257,7 @@ class EnvironmentState(Message, frozen=True, kw_only=True, tag="environment_stat
     awaited: bool = False
     """No worker has described the environment yet, and one does so now: ask again."""
     result: Bytes = b""
-    """The result of the finished run (`records.journal.Result`, JSON); empty without one."""
+    """The result of the finished run (`RunResult`, JSON); empty without one."""
 
 
 class RecordedRequest(FromOperator, frozen=True, kw_only=True, tag="recorded"):

@@ -9,15 +9,9 @@ import msgspec
 from evopolicy_common.catalogue import Suite
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.messages.bounds import Int, Named, Text, Word
-from evopolicy_common.messages.environment import (
-    FailedEpisodes,
-    HiddenEvaluation,
-    ObservationForm,
-    PolicyScope,
-    StepLimit,
-)
+from evopolicy_common.messages.environment import StepLimit
 from evopolicy_common.messages.episode import ResourceLimits, Tier
-from evopolicy_common.messages.gateway import FeedbackDetail, FinishRule, Profile, SimulationRule, VideoOption
+from evopolicy_common.messages.gateway import Conditions, VideoOption
 
 HiddenIsolation = Literal["exclusive", "shared", "waived", "unknown"]
 """Whether hidden episodes and agents could share a kernel. exclusive: never. shared: possible. waived: the
@@ -85,7 +79,15 @@ class Start(msgspec.Struct, frozen=True, kw_only=True):
         return f"submit {self.submit_index} of {self.run}"
 
 
-class RunSettings(msgspec.Struct, frozen=True, kw_only=True):
+class AllConditions(Conditions, frozen=True, kw_only=True):
+    """The conditions of a run with those that its gateway is not told."""
+
+    step_limit: StepLimit = "natural"
+    """Step limit: the published software's, or the environment's own."""
+    hidden_cases: HiddenCases = "shared"
+
+
+class RunSettings(AllConditions, frozen=True, kw_only=True):
     """Settings with which a run is opened. None means the suite's own number."""
 
     env: Word
@@ -100,23 +102,12 @@ class RunSettings(msgspec.Struct, frozen=True, kw_only=True):
     max_episodes_per_submit: Int | None = None
     n_validation: Int | None = None
     n_heldout: Int | None = None
-    policy_scope: PolicyScope = "episode"
-    observations: ObservationForm = "arrays"
     sandbox_tier: Tier = "bwrap"
-    video: VideoOption = "off"
     replays: VideoOption | None = None
     """Which held-out episodes of the selected checkpoint are recorded as video for people; None: as `video`."""
     limits: ResourceLimits = ResourceLimits()
     notes: Named[Text] = {}
     """The operator's own labels, such as the name of a sweep; kept in the coordinator's database, not in `run.json`."""
-    hidden_cases: HiddenCases = "shared"
-    simulation: SimulationRule = "forbidden"
-    finish: FinishRule = "early"
-    step_limit: StepLimit = "natural"
-    failed_episodes: FailedEpisodes = "play-on"
-    hidden_evaluation: HiddenEvaluation = "submit"
-    profile: Profile = "own"
-    feedback: FeedbackDetail = "pictures"
     agents_md: Word = ""
     """SHA-256, hex, of the operator's text in place of `AGENTS.md`; empty: the standard text."""
     prompts: Word = ""

@@ -6,7 +6,7 @@ Rules that this module owns:
   head(n) = SHA-256("evopolicy journal 1" NUL | head(n - 1) | SHA-256(entry n)).
 - A commitment is SHA-256("evopolicy commitment 1" NUL | salt | document). The salt is 32 random bytes, so that
   documents cannot be guessed; the document (`Opening`) holds all three splits and all settings of a run.
-- The entry that ends a run holds the SHA-256 of its result (`Result`).
+- The entry that ends a run holds the SHA-256 of its result (`RunResult`).
 
 Documents and entries are stored and published as the bytes that were hashed, and never encoded again: fields added by a
 later version do not change stored data.
@@ -17,15 +17,13 @@ from __future__ import annotations
 import hashlib
 import itertools
 from collections.abc import Iterable
-from typing import Any
 
 import msgspec
 
 from evopolicy_common.errors import DECODE_ERRORS, ProtocolError
-from evopolicy_common.messages.bounds import Int, Many, Named, Number, Plain, Word
+from evopolicy_common.messages.bounds import Int, Many, Number, Word
 from evopolicy_common.messages.environment import Case
-from evopolicy_common.messages.gateway import SubmitStatus
-from evopolicy_common.messages.operator import RunFinished
+from evopolicy_common.messages.operator import RunResult
 from evopolicy_common.messages.run_settings import RunSettings, Start
 
 EMPTY_HEAD = hashlib.sha256(b"evopolicy journal 1").hexdigest()
@@ -64,7 +62,7 @@ class Ended(msgspec.Struct, frozen=True, kw_only=True, tag="ended", tag_field="k
     status: Word
     """As in `run.json`."""
     result: Word
-    """SHA-256 (hex) of its `Result`."""
+    """SHA-256 (hex) of its `RunResult`."""
     at: Number
 
 
@@ -102,97 +100,7 @@ class Opening(msgspec.Struct, frozen=True, kw_only=True):
     """SHA-256 (hex) of the secret from which the policies' random seeds derive."""
 
 
-class SubmitResult(msgspec.Struct, frozen=True, kw_only=True):
-    submit_index: Int
-    status: SubmitStatus
-    bundle: Word | None
-    """SHA-256 (hex) of the policy's bundle."""
-    env_instances: Many[Int]
-    mean_return: Number | None
-    val_mean: Number | None
-    tree: Word = ""
-    """Digest of the workspace; empty where it was not recorded."""
-
-
-class Result(msgspec.Struct, frozen=True, kw_only=True):
-    """The numbers of a run's result."""
-
-    run: Word
-    status: Word
-    best_submit_index: Int | None
-    final_score: Number | None
-    heldout_returns: Many[Number]
-    random_heldout_returns: Many[Number]
-    validation_ineligible: Many[Int]
-    policy_failures: Named[Int]
-    budget_used: Int
-    infrastructure_retries: Int
-    nondeterministic_results: Int
-    submits: Many[SubmitResult]
-    heldout_successes: Many[bool] = ()
-    """Empty where the environment reports none."""
-    record: Plain = {}
-    """Further fields of `run.json` as they are published, by path."""
-
-
-GATEWAY_SIDE = (
-    "jail",
-    "agent.harness",
-    "agent.cli_version",
-    "agent.model_string",
-    "agent.retries",
-    "agent.turns",
-    "agent.tokens",
-    "agent.model_use",
-    "agent.resources",
-    "agent.settings",
-    "versions.agents_md_hash",
-    "versions.rules_hash",
-    "versions.initial_policy_hash",
-)
-"""Fields of `run.json` that a gateway's command knows, and sends as `record` when it closes the run."""
-
-
-def result_of(finished: RunFinished) -> Result:
-    """The part of a finished run that its last entry commits to."""
-    same = {name: getattr(finished, name) for name in Result.__struct_fields__ if name not in _OWN}
-    return Result(
-        **same,
-        validation_ineligible=tuple(sorted(finished.validation_ineligible)),
-        submits=msgspec.convert(finished.submits, tuple[SubmitResult, ...], from_attributes=True),
-        record=_record(finished),
-    )
-
-
-_OWN = ("validation_ineligible", "submits", "record")
-"""Fields of `Result` that are not those of `RunFinished` of the same name."""
-
-
-def _record(finished: RunFinished) -> dict[str, Any]:
-    sent = finished.agent.get("record")
-    fields = {name: sent[name] for name in GATEWAY_SIDE if name in sent} if isinstance(sent, dict) else {}
-    fingerprint = finished.fingerprint
-    hashes = {name: f"sha256:{digest}" for name, digest in finished.split_hashes.items()}
-    for name, split in (("train", "train"), ("valid", "validation"), ("heldout", "heldout")):
-        fields[f"versions.data_{name}_hash"] = hashes.get(f"{name}.json", hashes.get(split, ""))
-    if finished.random_heldout_returns:
-        fields["outcome.random_reference.seeded_by"] = "case"
-    for name in ("queue", "rollout", "finalise"):
-        fields[f"timing.{name}_s"] = round(float(finished.wall_s.get(name, 0.0)), 3)
-    return fields | {
-        "env_title": finished.env_title,
-        "env_family": finished.env_family,
-        "hidden_isolation": finished.hidden_isolation,
-        "outcome.closed_reason": finished.closed_reason,
-        "versions.env": finished.env_version,
-        "versions.env_deterministic": finished.deterministic,
-        "versions.fingerprint": {} if fingerprint is None else fingerprint.flat(),
-        "versions.fingerprint_overrides": ["left out" for _ in finished.fingerprint_overrides],
-        "versions.installations": list(finished.installations),
-    }
-
-
-def document(content: Entry | Opening | Result) -> bytes:
+def document(content: Entry | Opening | RunResult) -> bytes:
     """The bytes of a document or entry, as they are hashed and stored."""
     return msgspec.json.encode(content, order="sorted")
 

@@ -17,23 +17,15 @@ import msgspec
 
 from evopolicy_common.errors import DECODE_ERRORS, ProtocolError
 from evopolicy_common.messages.bounds import check_plausible
-from evopolicy_common.messages.environment import (
-    FailedEpisodes,
-    HiddenEvaluation,
-    ObservationForm,
-    PolicyScope,
-    Split,
-    StepLimit,
-)
-from evopolicy_common.messages.episode import FailureCategory, ResourceLimits, Tier
-from evopolicy_common.messages.gateway import FeedbackDetail, FinishRule, Profile, SimulationRule, VideoOption
+from evopolicy_common.messages.environment import Split
+from evopolicy_common.messages.episode import ResourceLimits, Tier
 from evopolicy_common.messages.operator import Committed, RunEnd
-from evopolicy_common.messages.run_settings import HiddenCases, HiddenIsolation, Line, Start, metering_of
+from evopolicy_common.messages.run_settings import AllConditions, HiddenIsolation, Line, Start, metering_of
 from evopolicy_common.records.code_metrics import PUBLISHED_SCHEMA
 from evopolicy_common.records.model_record import Level
 from evopolicy_common.records.newest import described_data
 
-RECORD_VERSION = 4
+RECORD_VERSION = 5
 """Version of our own fields. Incremented only when older readers would misunderstand a file, not for added fields."""
 
 PROTOCOL_VERSION = "protocol/v2.0-draft"
@@ -199,38 +191,19 @@ class Agent(msgspec.Struct, frozen=True, kw_only=True):
     """None for agents that were not started here."""
 
 
-class ExperimentDimensions(msgspec.Struct, frozen=True, kw_only=True):
-    """Settings that make runs incomparable if they differ."""
+class ExperimentDimensions(AllConditions, frozen=True, kw_only=True):
+    """The conditions and numbers that define the experiment; runs that differ here are not comparable."""
 
     episode_budget: int
     min_episodes_per_submit: int
     max_episodes_per_submit: int
-    policy_scope: PolicyScope
-    observations: ObservationForm
     n_train: int
     n_validation: int
     n_heldout: int
-    video: VideoOption = "off"
     limits: ResourceLimits | None = None
-    simulation: SimulationRule = "allowed"
-    """Whether the rules allow the agent to simulate the environment."""
-    finish: FinishRule = "early"
-    """A run whose agent stops before its budget is spent is scored (`early`), or an error (`budget`)."""
-    step_limit: StepLimit = "natural"
-    """The published software's, or the environment's own."""
-    failed_episodes: FailedEpisodes = "play-on"
-    """After a policy's failure, random actions play the episode (`play-on`), or the submit has no mean return and is
-    not eligible (`end-submit`)."""
-    hidden_evaluation: HiddenEvaluation = "submit"
-    """A policy's arguments on hidden cases: its own submit's, or those of one list of all cases (`pool`)."""
-    profile: Profile = "own"
-    """`published`: all choices of the published protocol, its public case files included."""
-    feedback: FeedbackDetail = "pictures"
-    """The agent's feedback level."""
+    """None: unknown, as in runs of the published software."""
     agents_md: str = ""
     """SHA-256 (`sha256:…`) of the operator's text in place of `AGENTS.md`; empty: the standard text."""
-    hidden_cases: HiddenCases = "shared"
-    """Validation and held-out cases: `shared` by all runs of the environment, or `per_run` (not paired)."""
 
 
 class Timing(msgspec.Struct, frozen=True, kw_only=True):
@@ -256,27 +229,13 @@ class Timing(msgspec.Struct, frozen=True, kw_only=True):
     """From the agent's end to `run.json`."""
 
 
-class PolicyFailureRecord(msgspec.Struct, frozen=True, kw_only=True):
-    """A policy's failure in one hidden episode (train failures are in the feedback)."""
-
-    split: Split
-    submit_index: int
-    episode: int
-    """Position in the split, from 0."""
-    category: FailureCategory
-    step_index: int | None = None
-    message: str = ""
-
-
 class ReferenceScore(msgspec.Struct, frozen=True, kw_only=True):
-    """The score of uniform random actions on this run's own held-out cases."""
+    """The score of uniform random actions on this run's own held-out cases; equal in every run on the split."""
 
     mean_return: float
     std_return: float
     """Population standard deviation."""
     returns: tuple[float, ...] = ()
-    seeded_by: Literal["case", "run"] = "run"
-    """Source of the actions. `case`: split and case, so that runs have equal numbers. `run`: a secret of the run."""
 
 
 class Outcome(msgspec.Struct, frozen=True, kw_only=True):
@@ -297,8 +256,7 @@ class Outcome(msgspec.Struct, frozen=True, kw_only=True):
     heldout_returns: tuple[float, ...] = ()
     """In the order of the split's cases."""
     heldout_successes: tuple[bool, ...] = ()
-    """Whether each episode solved the task; empty if the environment does not report it."""
-    policy_failures: tuple[PolicyFailureRecord, ...] = ()
+    """Whether each of these episodes solved the task, as the environment reports it; empty where it reports nothing."""
     quarantined_submits: tuple[int, ...] = ()
     """`ok` checkpoints that are not eligible (`failed_episodes` = "end-submit"): their policy failed in
     validation."""
@@ -444,7 +402,7 @@ class RunRecord(msgspec.Struct, frozen=True, kw_only=True):
     replays: tuple[Replay, ...] = ()
     versions: Versions
     committed: Committed | None = None
-    """The coordinator's commitment before the agent started."""
+    """The coordinator's commitment before the agent started; None in a directory of the published software."""
     start: Start | None = None
     """The submit of an earlier run with whose workspace this one began."""
     replay_of: str = ""

@@ -14,7 +14,6 @@ from collections.abc import Callable
 
 from evopolicy_coordinator.core.agents import permits, requests
 from evopolicy_coordinator.core.contract.records import (
-    RunStateRow,
     Snapshot,
     SubmitRow,
     submit_group,
@@ -44,7 +43,7 @@ def load(state: State, snapshot: Snapshot, step: Step, drain: Callable[[State, S
     for submit in snapshot.submits:
         submits_of[submit.run].append(submit)
     for row in sorted(snapshot.runs, key=lambda row: (row.created_at, row.run)):
-        last = stored.get(row.run, RunStateRow(run=row.run))
+        last = stored[row.run]
         if last.phase == "finished":
             state.run_keys[row.key] = row.run
             state.capabilities[row.run] = row.capability

@@ -120,17 +120,12 @@ class ServiceReader:
     def epochs(self, runs: tuple[str, ...]) -> tuple[str, ...]:
         """The distinct epochs of finished runs that are to be published. Reads the database.
 
-        Raises RefusedError for a run that is unknown, unfinished, or has no commitment.
+        Raises RefusedError for a run that is unknown or unfinished.
         """
         rows = {run: self.finished_run(run) for run in runs}
         for run, row in rows.items():
             if row is None:
                 raise RefusedError(Refusal.UNKNOWN_RUN, f"there is no finished run {run[:64]!r} here")
-            text = (
-                f"run {run} was opened before this coordinator kept a journal: it has no commitment to its"
-                " cases, which cannot be added later, so it cannot be published"
-            )
-            require(row.committed is not None, Refusal.BAD_REQUEST, text)
         return tuple(dict.fromkeys(row.epoch for row in rows.values() if row is not None))
 
     def finished_with_result(self, run: str) -> tuple[RunRow, RunFinished]:
@@ -146,7 +141,7 @@ class ServiceReader:
 
     def result(self, run: str) -> bytes:
         """A finished run's result as a document. Reads the database. Raises RefusedError for any other run."""
-        return journal.document(journal.result_of(self.finished_with_result(run)[1]))
+        return journal.document(self.finished_with_result(run)[1].result)
 
     def revealed(self) -> frozenset[str]:
         """Epochs whose cases are public. Reads the database."""

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import base64
 import contextlib
+import hashlib
 import hmac
 import secrets
 from collections.abc import Iterator
@@ -136,10 +137,12 @@ class RunRequests:
             if wanted.hidden_evaluation == "pool":
                 largest = max(most, len(cases.validation), len(cases.heldout))
             check_job((*cases.train, *hidden), largest)
+        secret = run_secret(self._reader.state, m.key)
         return RunRow(
             **self._own(m.key, cases.epoch),
             key=m.key,
-            secret=run_secret(self._reader.state, m.key),
+            secret=secret,
+            policy_seeds=hashlib.sha256(secret).hexdigest(),
             settings=wanted,
             budget=budget,
             min_episodes_per_submit=least,
@@ -148,7 +151,7 @@ class RunRequests:
             validation=cases.validation,
             heldout=cases.heldout,
             split_hashes=cases.hashes(),
-            split_secret=cases.secret,
+            cases_secret=cases.secret,
             epoch=cases.epoch,
             trials=cases.trials,
             allowed_imports=self.allowed_imports,
@@ -173,7 +176,7 @@ class RunRequests:
         names = [each for each in wanted.__struct_fields__ if getattr(wanted, each) != getattr(same, each)]
         if names:
             raise ConfigError(f"a replay of run {of.run} has other settings than the run: {', '.join(names)}")
-        return replace(of, key=m.key, settings=wanted, committed=None, **self._own(m.key, of.epoch))
+        return replace(of, key=m.key, settings=wanted, **self._own(m.key, of.epoch))
 
     def _own(self, key: str, epoch: str) -> dict[str, Any]:
         """The name and the secrets that every run has of its own, a replay too. With other cases it is another run."""
@@ -357,9 +360,12 @@ def _conditions(row: RunRow, agent: dict[str, Any]) -> Line:
     told, own = agent.get("record"), Line(sandbox_tier=row.settings.sandbox_tier)
     if not isinstance(told, dict):
         return own
-    use = told.get("agent.model_use")
+    told_agent = told.get("agent")
+    use = told_agent.get("model_use") if isinstance(told_agent, dict) else None
     counted_by = use.get("metering") if isinstance(use, dict) else None
-    metering = metering_of(counted_by, told.get("agent.model_string"))
+    metering = metering_of(
+        counted_by, told_agent.get("model_string") if isinstance(told_agent, dict) else None
+    )
     own = replace(own, jail=told.get("jail"), metering=metering)
     return own.weakest(own)  # of known words alone: a gateway may tell anything
 

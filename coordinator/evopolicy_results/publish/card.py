@@ -20,9 +20,9 @@ import msgspec
 
 from evopolicy_common import catalogue
 from evopolicy_common.catalogue.installs import Licence, family_of, licences
+from evopolicy_common.messages.operator import RunResult
 from evopolicy_common.records import journal
 from evopolicy_common.records.aggregates import mean
-from evopolicy_common.records.journal import Result
 from evopolicy_common.records.run_record import RunRecord
 from evopolicy_common.records.summary import utc_text
 from evopolicy_common.records.words import CANARY
@@ -63,7 +63,7 @@ _ALWAYS = (
 class Source(NamedTuple):
     folder: str
     record: RunRecord
-    result: Result
+    result: RunResult
 
 
 class CardRun(msgspec.Struct, frozen=True, kw_only=True):

@@ -24,10 +24,10 @@ import numpy as np
 
 from evopolicy_common.errors import ConfigError, EvopolicyError, RefusedError
 from evopolicy_common.messages.environment import Split
+from evopolicy_common.messages.operator import RunResult, SubmitResult
 from evopolicy_common.records import journal
 from evopolicy_common.records.episodes.rendered import decode
 from evopolicy_common.records.episodes.trajectory import Recorder, Trajectory
-from evopolicy_common.records.journal import Result, SubmitResult
 from evopolicy_common.records.policies.bundles import Bundle
 from evopolicy_common.records.policies.checkpoints import bundle_of
 from evopolicy_common.records.run_files import read_or_reason, run_folders
@@ -83,7 +83,7 @@ def find_runs(paths: Sequence[Path]) -> tuple[list[tuple[Path, RunRecord]], list
         if isinstance(record, str):
             why = record
         elif record.committed is None:
-            why = "it has no commitment: its coordinator kept no journal when it opened the run"
+            why = "its run.json names no commitment"
         elif record.replay_of:
             why = f"it is a replay of run {record.replay_of}, and no run of its own"
         elif record.run in runs:
@@ -252,7 +252,7 @@ class Publisher:
 
     async def _add_run(self, source: _Source, place: str) -> cards.Source:
         opened = await self._ask.opening(source.record.run)
-        result = msgspec.json.decode(opened.result, type=Result)
+        result = msgspec.json.decode(opened.result, type=RunResult)
         kept, removed = scrub.record(source.record)
         for each in removed:
             self._leave_out(f"{place}/run.json: {each.what}", each.why)

@@ -29,8 +29,8 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
 from evopolicy_common.errors import DECODE_ERRORS, ProtocolError
 from evopolicy_common.messages.bounds import Int, Many, Number, Word
 from evopolicy_common.messages.environment import Split
+from evopolicy_common.messages.operator import RunResult
 from evopolicy_common.records import journal
-from evopolicy_common.records.journal import Result
 
 FORMAT = "evopolicy results"
 VERSION = 1
@@ -134,7 +134,7 @@ def group_name(split: str, submit_index: int) -> str:
     return f"{split}-random" if submit_index == RANDOM else f"{split}-{submit_index:03d}"
 
 
-def wanted_groups(result: Result) -> list[tuple[Split, int, int]]:
+def wanted_groups(result: RunResult) -> list[tuple[Split, int, int]]:
     """The groups whose returns a result rests on: split, submit index, number of episodes (-1: all of the split)."""
     groups: list[tuple[Split, int, int]] = []
     ok = [submit for submit in result.submits if submit.status == "ok"]

@@ -3,15 +3,16 @@ documents."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from typing import Any, Literal, NamedTuple, Protocol, TypeVar
 
 import msgspec
 
 from evopolicy_common.errors import DECODE_ERRORS, BundleError, ProtocolError
 from evopolicy_common.messages.environment import Split
+from evopolicy_common.messages.operator import RunResult
 from evopolicy_common.records import journal
-from evopolicy_common.records.journal import Opening, Result
+from evopolicy_common.records.journal import Opening
 from evopolicy_common.records.policies import bundles
 from evopolicy_common.records.policies.bundles import Bundle
 from evopolicy_common.records.run_record import RunRecord
@@ -76,7 +77,7 @@ class PublishedRun(msgspec.Struct, frozen=True, kw_only=True):
     record: RunRecord
     opening: Opening
     salt: bytes
-    result: Result
+    result: RunResult
     groups: tuple[Group, ...]
     opening_bytes: bytes
     result_bytes: bytes
@@ -174,9 +175,9 @@ class Checked(msgspec.Struct, kw_only=True):
         elif not faults:
             self.add(kind, "ok", ok, run)
 
-    def refuse_unknown(self, name: str, value: Any, committed: Mapping[str, Any], run: str = "") -> None:
+    def refuse_unknown(self, name: str, value: Any, run: str = "", told: bool = False) -> None:
         """Refuses fields that the table of `fields` does not name, and notes those that are claims."""
-        unknown, claims = fields.unknown_and_claims(name, value, committed)
+        unknown, claims = fields.unknown_and_claims(name, value, told)
         for field in unknown[:_SHOWN]:
             text = f"{name}: {field[:120]} is no field of published results: {UPDATE}"
             self.add("format", "failed", text, run)

@@ -123,7 +123,7 @@ def _document(files: Files, name: str, kind: Callable[..., T] | type[T], checked
     """A file's content. Raises ProtocolError for a damaged one. `checked` receives its unknown fields and claims."""
     data = files.read(name, contents.MAX_DOCUMENT_BYTES)
     content = decoded(name, data, kind)
-    checked.refuse_unknown(name, fields.parsed(name, data), {})
+    checked.refuse_unknown(name, fields.parsed(name, data))
     return content
 
 

@@ -3,31 +3,39 @@ recordings."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from itertools import zip_longest
 from typing import Any
 
 import msgspec
 
-from evopolicy_common import catalogue
 from evopolicy_common.catalogue import worlds
 from evopolicy_common.errors import ProtocolError
+from evopolicy_common.messages.operator import RunFinished, RunResult
 from evopolicy_common.messages.run_settings import Line
-from evopolicy_common.records import journal
+from evopolicy_common.records import account, journal
 from evopolicy_common.records.aggregates import best_validated, mean
-from evopolicy_common.records.code_metrics import TREND, code_metrics
+from evopolicy_common.records.code_metrics import code_metrics
 from evopolicy_common.records.episodes.compare import same
 from evopolicy_common.records.episodes.trajectory import Trajectory, decode
-from evopolicy_common.records.journal import Ended, Opened, Opening, Result, Revealed
+from evopolicy_common.records.journal import Ended, Opened, Opening, Revealed
 from evopolicy_common.records.policies.bundles import Bundle
-from evopolicy_common.records.run_record import PROTOCOL_VERSION, decode_run_record, inputs_digest
-from evopolicy_common.records.splits import FILE_STEMS, SPLITS, cases_hash, overlaps
-from evopolicy_common.records.summary import utc_text
+from evopolicy_common.records.run_record import decode_run_record, inputs_digest
+from evopolicy_common.records.splits import SPLITS, cases_hash, overlaps
 from evopolicy_common.terminal import counted
 from evopolicy_results.publish import contents, fields
 from evopolicy_results.publish.contents import Group
-from evopolicy_results.publish.findings import KINDS, Checked, Fault, Files, History, PublishedRun, decoded
-from evopolicy_results.verify.numbers import outcome_pairs, short
+from evopolicy_results.publish.findings import (
+    KINDS,
+    UPDATE,
+    Checked,
+    Fault,
+    Files,
+    History,
+    PublishedRun,
+    decoded,
+)
+from evopolicy_results.verify.numbers import MISSING, as_json, short, unlike_documents
 
 _SHOWN = 8
 """Signals of a run that become findings."""
@@ -48,7 +56,7 @@ def read_run(files: Files, folder: str, checked: Checked) -> PublishedRun | None
             record=decode_run_record(data[contents.RUN]),
             opening=decoded(place[contents.OPENING], data[contents.OPENING], Opening),
             salt=bytes.fromhex(salt),
-            result=decoded(place[contents.RESULT], data[contents.RESULT], Result),
+            result=decoded(place[contents.RESULT], data[contents.RESULT], RunResult),
             groups=decoded(place[contents.EPISODES], data[contents.EPISODES], tuple[Group, ...]),
             opening_bytes=data[contents.OPENING],
             result_bytes=data[contents.RESULT],
@@ -60,7 +68,7 @@ def read_run(files: Files, folder: str, checked: Checked) -> PublishedRun | None
         checked.add("format", "failed", f"{folder}: {error}", folder)
         return None
     for name in (contents.EPISODES, contents.RUN):
-        checked.refuse_unknown(place[name], written[name], run.result.record, run.opening.run)
+        checked.refuse_unknown(place[name], written[name], run.opening.run, bool(run.result.record))
     return run
 
 
@@ -148,66 +156,47 @@ def _result(run: PublishedRun, history: History) -> Iterator[str | Fault]:
         yield Fault("record", "run.json has another end of the run than the journal has")
 
 
-_RECORD_AS_SET = "env model exp_id repeat attempt sandbox_tier start replay_of"
-_DIMENSIONS_AS_SET = """
-    policy_scope observations simulation video limits finish step_limit profile feedback failed_episodes
-    hidden_evaluation hidden_cases
-"""
-"""Fields that a setting of the same name determines."""
-
-
-def _record(run: PublishedRun, history: History) -> Iterator[str]:
-    """`run.json`, compared with the committed documents."""
-    record, opening, result = run.record, run.opening, run.result
-    settings, dimensions, agent = opening.settings, record.experiment_dimensions, record.agent
-    # A run that ended before it had a workspace tells no counts.
-    staged = dimensions.n_train > 0 or bool(result.submits)
-    pairs: list[tuple[str, Any, Any]] = [
-        ("protocol_version", record.protocol_version, PROTOCOL_VERSION),
-        ("run", record.run, opening.run),
-        ("agent.entry", agent.entry, settings.entry),
-        ("agent.inputs", inputs_digest(agent.inputs), settings.inputs),
-        ("agent.prompts", agent.prompts, settings.prompts and f"sha256:{settings.prompts}"),
-        ("agents_md", dimensions.agents_md, settings.agents_md and f"sha256:{settings.agents_md}"),
-        ("episode_budget", dimensions.episode_budget, opening.budget),
-        ("trees", record.trees, {str(one.submit_index): one.tree for one in result.submits if one.tree}),
-        ("versions.data_secret", record.versions.data_secret, opening.cases_secret),
-        ("n_train", dimensions.n_train, staged * len(opening.train)),
-    ]
-    for part, names in ((record, _RECORD_AS_SET), (dimensions, _DIMENSIONS_AS_SET)):
-        pairs += [(name, getattr(part, name), getattr(settings, name)) for name in names.split()]
-    for name in ("min_episodes_per_submit", "max_episodes_per_submit"):
-        pairs.append((name, getattr(dimensions, name), staged * getattr(opening, name)))
-    suite = catalogue.suite_of(settings.env) if catalogue.is_shipped(settings.env) else catalogue.OTHER
-    for name, cases in (("n_validation", opening.validation), ("n_heldout", opening.heldout)):
-        # Where files determine the cases, `run.json` may tell the suite's number.
-        if getattr(dimensions, name) != getattr(suite, name) or getattr(settings, name) is not None:
-            pairs.append((name, getattr(dimensions, name), len(cases)))
-    for path, fixed in result.record.items():
-        here = fields.value_at(run.as_written, path)
-        if contents.document(here) != contents.document(fixed):
-            pairs.append((path, here, fixed))
-    if not result.random_heldout_returns:
-        pairs.append(("outcome.random_reference", record.outcome.random_reference, None))
+def _record(run: PublishedRun, history: History) -> Iterator[str | Fault]:
+    """`run.json`, compared with what `account.run_record` makes of the committed documents and of its claims."""
+    record, opening, result, place = run.record, run.opening, run.result, run.record.committed
+    if place is None:
+        return  # `_commitment` reports it
+    try:
+        claims = account.claims_in(record)
+        if result.record:
+            told = msgspec.convert(result.record, account.Told)
+            claims = msgspec.structs.replace(claims, **msgspec.structs.asdict(told))
+    except msgspec.ValidationError as error:
+        yield f"run.json or result.json tells claims in another form than the software: {error}"
+        return
     began, over = history.entry(Opened, opening.run), history.entry(Ended, opening.run)
-    if began is not None and over is not None:
-        start, end, timing = began[1].at, over[1].at, record.timing
-        pairs += [
-            ("timing.start_time", timing.start_time, utc_text(start)),
-            ("timing.end_time", timing.end_time, utc_text(end)),
-            ("timing.wall_time_seconds", timing.wall_time_seconds, round(end - start, 3)),
-        ]
-    for split in SPLITS:
-        ours = f"sha256:{cases_hash(run.cases(split))}"
-        pairs.append((f"the hash of the {FILE_STEMS[split]} cases", record.versions.cases_hash(split), ours))
-    yield from _unlike(pairs, "committed to was")
-    yield from _unlike(outcome_pairs(record.outcome, result), "what came of the run is")
-
-
-def _unlike(told: Iterable[tuple[str, Any, Any]], source: str) -> Iterator[str]:
-    for name, here, fixed in told:
-        if here != fixed:
-            yield f"run.json has {name} {short(here)}; {source} {short(fixed)}"
+    fixed = {name: getattr(result, name) for name in RunResult.__struct_fields__}
+    fixed["split_hashes"] = result.split_hashes | {split: cases_hash(run.cases(split)) for split in SPLITS}
+    finished = RunFinished(
+        **fixed,
+        settings=opening.settings,
+        error=None,
+        agent={},
+        fingerprint_overrides=("left out",) * result.n_overrides,
+        budget=opening.budget,
+        min_episodes_per_submit=opening.min_episodes_per_submit,
+        max_episodes_per_submit=opening.max_episodes_per_submit,
+        n_train=len(opening.train),
+        n_validation=len(opening.validation),
+        n_heldout=len(opening.heldout),
+        cases_secret=opening.cases_secret,
+        created_at=0.0 if began is None else began[1].at,
+        finished_at=0.0 if over is None else over[1].at,
+        committed=place,
+    )
+    for name, here, wanted in unlike_documents(run.as_written, as_json(account.run_record(finished, claims))):
+        if wanted is MISSING:
+            yield Fault("format", f"run.json: {name[:120]} is no field of published results: {UPDATE}")
+        else:
+            yield f"run.json has {name} {short(here)}; the committed documents give {short(wanted)}"
+    told_inputs = inputs_digest(record.agent.inputs)
+    if told_inputs != opening.settings.inputs:
+        yield f"run.json has agent.inputs {short(told_inputs)}; committed to was {short(opening.settings.inputs)}"
 
 
 def _budget(run: PublishedRun, history: History) -> Iterator[str]:
@@ -424,19 +413,11 @@ def _checkpoints(files: Files, run: PublishedRun, damaged: set[str], checked: Ch
 
 def _metrics(run: PublishedRun, policies: dict[int, Bundle], checked: Checked) -> Iterator[str]:
     """The metrics of code in `run.json`, compared with the policies."""
-    told = run.record.outcome.auxiliary
-    if not told.keys() & {_BY_SUBMIT, "code_metrics_best", "code_metrics_trend"}:
-        return  # a run of an early version
-    by_submit, best = told.get(_BY_SUBMIT, {}), run.record.outcome.best_submit_index
+    by_submit = run.record.outcome.auxiliary.get(_BY_SUBMIT, {})
     file = f"{run.folder}/{contents.RUN}"
+    wanted = [str(submit.submit_index) for submit in run.result.submits]
+    pairs: list[tuple[str, Any, Any]] = [(_BY_SUBMIT, list(by_submit), wanted)]
     try:
-        trend = {name: [each[name] for each in by_submit.values()] for name in TREND}
-        trend["submits"] = list(map(int, by_submit))
-        pairs: list[tuple[str, Any, Any]] = [
-            (_BY_SUBMIT, list(by_submit), [str(submit.submit_index) for submit in run.result.submits]),
-            ("code_metrics_best", told.get("code_metrics_best"), by_submit.get(str(best))),
-            ("code_metrics_trend", told.get("code_metrics_trend"), trend),
-        ]
         for index, here in by_submit.items():
             where = f"outcome.auxiliary.{_BY_SUBMIT}.{index}"
             if (policy := policies.get(int(index))) is None:

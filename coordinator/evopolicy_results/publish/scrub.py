@@ -61,7 +61,6 @@ def record(full: RunRecord) -> tuple[RunRecord, list[Removed]]:
         outcome=replace(
             outcome,
             error=None if outcome.error is None else "left out",
-            policy_failures=tuple(replace(each, message="") for each in outcome.policy_failures),
         ),
         rejected_submits=tuple(replace(each, message="") for each in full.rejected_submits),
         artifacts=Artifacts(),

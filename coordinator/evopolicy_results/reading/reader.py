@@ -14,7 +14,6 @@ import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 import msgspec
 from msgspec.structs import replace
@@ -29,7 +28,6 @@ from evopolicy_common.records.policies.submits import read_submits
 from evopolicy_common.records.rescores import Rescored, RescoreRecord, read_rescore
 from evopolicy_common.records.run_files import RUN_JSON, check_places, run_folders
 from evopolicy_common.records.run_record import (
-    PolicyFailureRecord,
     ReferenceScore,
     RunRecord,
     decode_run_record,
@@ -314,13 +312,6 @@ def rescored(runs: Sequence[Run], name: str) -> list[Run]:
 
 def _replaced(run: Run, record: RescoreRecord, played: Rescored) -> Run:
     outcome, versions, random = run.record.outcome, run.record.versions, record.random_returns
-    categories: dict[str, Any] = {**played.failures}
-    failures = [each for each in outcome.policy_failures if each.split != _HELDOUT] + [
-        PolicyFailureRecord(
-            split=_HELDOUT, submit_index=record.selected, episode=int(case), category=category
-        )
-        for case, category in sorted(categories.items())
-    ]
     replaced = replace(
         run.record,
         outcome=replace(
@@ -331,9 +322,8 @@ def _replaced(run: Run, record: RescoreRecord, played: Rescored) -> Run:
             heldout_returns=tuple(played.returns),
             # As in a run's own result: a rate over the episodes that report it would leave failed ones out.
             heldout_successes=() if None in played.successes else tuple(map(bool, played.successes)),
-            policy_failures=tuple(failures),
             random_reference=ReferenceScore(
-                mean_return=mean(random), std_return=std(random), returns=tuple(random), seeded_by="case"
+                mean_return=mean(random), std_return=std(random), returns=tuple(random)
             ),
         ),
         experiment_dimensions=replace(run.record.experiment_dimensions, n_heldout=record.n_cases),

@@ -187,7 +187,7 @@ def returns_of(run: Run) -> RunReturns:
 def _reference_of(run: Run) -> RunReturns | None:
     """The recorded returns of the random reference on the run's cases; None for cases or actions of its own."""
     recorded, case_set = run.record.outcome.random_reference, returns_of(run).case_set
-    if recorded is None or not recorded.returns or recorded.seeded_by != "case" or not case_set:
+    if recorded is None or not recorded.returns or not case_set:
         return None
     return RunReturns(score=recorded.mean_return, returns=recorded.returns, case_set=case_set)
 
@@ -195,21 +195,16 @@ def _reference_of(run: Run) -> RunReturns | None:
 def references(runs: Iterable[Run]) -> dict[str, float]:
     """Mean held-out return of uniform random actions by environment: one number per held-out split.
 
-    The actions follow from split and case, so all runs on a split record the same number. Runs of earlier versions
-    each drew their own: they count only for a split that no newer run has played, with the mean of their numbers. An
-    environment whose runs have several splits gets the mean over the splits.
+    The actions follow from split and case, so all runs on a split record the same number. An environment whose runs
+    have several splits gets the mean over the splits.
     """
-    by_env: dict[str, dict[str, dict[str, list[float]]]] = {}
+    by_env: dict[str, dict[str, list[float]]] = {}
     for run in runs:
         reference = run.record.outcome.random_reference
         if reference is not None and math.isfinite(reference.mean_return):
             by_split = by_env.setdefault(run.env, {})
-            by_seeding = by_split.setdefault(run.record.versions.cases_hash("heldout"), {})
-            by_seeding.setdefault(reference.seeded_by, []).append(reference.mean_return)
-    return {
-        env: _one_mean([_one_mean(each.get("case") or each["run"]) for each in by_split.values()])
-        for env, by_split in by_env.items()
-    }
+            by_split.setdefault(run.record.versions.cases_hash("heldout"), []).append(reference.mean_return)
+    return {env: _one_mean([_one_mean(each) for each in splits.values()]) for env, splits in by_env.items()}
 
 
 def _one_mean(values: Sequence[float]) -> float:

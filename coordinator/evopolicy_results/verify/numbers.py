@@ -6,7 +6,7 @@ Rules that this module owns:
   the budget.
 - If the coordinator still has the run, its result decides the rest: which submits there were, of which policies, and
   all scores.
-- Every difference names the file and both values. Missing fields of earlier versions are no difference.
+- Every difference names the file and both values.
 """
 
 from __future__ import annotations
@@ -14,26 +14,31 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from typing import Any
 
+import msgspec
+
 from evopolicy_common.errors import BundleError, ConfigError, ProtocolError
 from evopolicy_common.messages.gateway import CANCELLED
+from evopolicy_common.messages.operator import RunResult, SubmitResult
+from evopolicy_common.records import account
 from evopolicy_common.records.aggregates import best_validated, mean, std
-from evopolicy_common.records.journal import Result, SubmitResult
 from evopolicy_common.records.policies import trees
 from evopolicy_common.records.policies.checkpoints import bundle_of
 from evopolicy_common.records.policies.submits import SubmitFiles
 from evopolicy_common.records.rescores import FOLDER, RescoreRecord, read_rescore, rescore_names
-from evopolicy_common.records.run_record import Outcome
+from evopolicy_common.records.run_record import RunRecord
 from evopolicy_common.records.summary import Summary
 from evopolicy_results.verify.source import RunUnderTest
 
 Told = Iterable[tuple[str, Any, Any]]
 """Names of numbers, each with its value and what it has to be."""
 
+MISSING = type("Missing", (), {"__repr__": lambda self: "nothing"})()
+"""The value of a field that a document does not have."""
 _MAX_CHARS = 80
 _STORED = "the coordinator has"
 
 
-def differences(run: RunUnderTest, result: Result | None) -> Iterator[tuple[str, str]]:
+def differences(run: RunUnderTest, result: RunResult | None) -> Iterator[tuple[str, str]]:
     """Pairs of a file and what differs in it. `result`: the coordinator's; None when it does not have the run."""
     stored = {submit.submit_index: submit for submit in result.submits} if result is not None else {}
     spent = 0
@@ -57,8 +62,8 @@ def differences(run: RunUnderTest, result: Result | None) -> Iterator[tuple[str,
     if result is not None:
         here = [submit.index for submit in run.submits if submit.status != CANCELLED]
         known_trees = {str(submit.submit_index): submit.tree for submit in result.submits if submit.tree}
-        pairs = [("submits", here, sorted(stored)), *outcome_pairs(run.record.outcome, result)]
-        yield from _unlike("run.json", [*pairs, ("trees", run.record.trees, known_trees)], _STORED)
+        pairs = [("submits", here, sorted(stored)), ("trees", run.record.trees, known_trees)]
+        yield from _unlike("run.json", [*pairs, *_stored_outcome(run.record, result)], _STORED)
     for index, digest in run.record.trees.items():
         name = trees.name_of(run.root, int(index))
         try:
@@ -76,33 +81,32 @@ def differences(run: RunUnderTest, result: Result | None) -> Iterator[tuple[str,
             yield file, str(error)
 
 
-def outcome_pairs(outcome: Outcome, result: Result) -> Iterator[tuple[str, Any, Any]]:
-    """The numbers of `run.json` that a result determines, with what it has."""
-    completed = result.status == "completed"
-    given_up = outcome.status == "error" and result.status == "cancelled"
-    heldout, reference = result.heldout_returns, outcome.random_reference
-    val_scores = {
-        str(each.submit_index): each.val_mean for each in result.submits if each.val_mean is not None
-    }
-    score = result.final_score if completed else 0.0 if result.status == "no_ok_submit" else None
-    yield "status", outcome.status, outcome.status if given_up else result.status
-    yield "final_score", outcome.final_score, score
-    yield "best_submit_index", outcome.best_submit_index, result.best_submit_index if completed else None
-    yield "heldout_returns", outcome.heldout_returns, heldout if completed else ()
-    yield "heldout_successes", outcome.heldout_successes, result.heldout_successes if completed else ()
-    yield "heldout_mean_return", outcome.heldout_mean_return, result.final_score if completed else None
-    yield "heldout_std_return", outcome.heldout_std_return, std(heldout) if completed and heldout else None
-    yield "val_scores", outcome.val_scores, val_scores if completed else None
-    yield "budget_used", outcome.budget_used, result.budget_used
-    yield "quarantined_submits", outcome.quarantined_submits, result.validation_ineligible
-    for name in ("policy_failures", "infrastructure_retries", "nondeterministic_results"):
-        if name in outcome.auxiliary:
-            yield f"auxiliary.{name}", outcome.auxiliary[name], getattr(result, name)
-    random = result.random_heldout_returns
-    yield "random returns", () if reference is None else reference.returns, random
-    if reference is not None and random:
-        yield "mean of random actions", reference.mean_return, mean(random)
-        yield "standard deviation of random actions", reference.std_return, std(random)
+def _stored_outcome(record: RunRecord, result: RunResult) -> Told:
+    """The outcome in `run.json` against the one that the coordinator's result gives."""
+    outcome = record.outcome
+    try:
+        claims = account.claims_in(record)
+    except msgspec.ValidationError as error:
+        yield "metrics of code", str(error), "as the software writes them"
+        return
+    wanted = account.outcome(result, claims)
+    yield from unlike_documents(as_json(outcome), as_json(wanted), "outcome")
+
+
+def as_json(value: Any) -> Any:
+    """The JSON document of a record."""
+    return msgspec.json.decode(msgspec.json.encode(value))
+
+
+def unlike_documents(told: Any, wanted: Any, path: str = "") -> Iterator[tuple[str, Any, Any]]:
+    """The fields in which two JSON documents differ, by their paths, with both values (`MISSING` for none)."""
+    if isinstance(told, dict) and isinstance(wanted, dict):
+        for name in dict.fromkeys((*told, *wanted)):
+            pair = (told.get(name, MISSING), wanted.get(name, MISSING))
+            yield from unlike_documents(*pair, f"{path}.{name}" if path else name)
+    # As JSON, 1 is no 1.0 and no true.
+    elif told is MISSING or wanted is MISSING or msgspec.json.encode(told) != msgspec.json.encode(wanted):
+        yield path, told, wanted
 
 
 def _outcome(run: RunUnderTest, spent: int) -> Told:

@@ -20,12 +20,11 @@ import msgspec
 from evopolicy_common.errors import BundleError, ConfigError
 from evopolicy_common.messages.episode import EpisodeOutcome
 from evopolicy_common.messages.gateway import CANCELLED
-from evopolicy_common.messages.operator import DescribeEnvironment, EnvironmentState
+from evopolicy_common.messages.operator import DescribeEnvironment, EnvironmentState, RunResult
 from evopolicy_common.records.aggregates import mean
 from evopolicy_common.records.episodes import compare
 from evopolicy_common.records.episodes.rendered import decode
 from evopolicy_common.records.episodes.trajectory import Trajectory
-from evopolicy_common.records.journal import Result
 from evopolicy_common.records.policies.checkpoints import bundle_of
 from evopolicy_common.records.rescores import FOLDER, rescore_names
 from evopolicy_common.records.splits import SPLITS
@@ -125,7 +124,7 @@ class Verifier:
                     " --data"
                 )
         self._knows_run = state.knows_run
-        result = msgspec.json.decode(state.result, type=Result) if state.result else None
+        result = msgspec.json.decode(state.result, type=RunResult) if state.result else None
         for name, difference in numbers.differences(self._run, result):
             self.report.differs(name, difference)
         for submit in self._run.submits:

@@ -38,7 +38,7 @@ def test_the_golden_run_is_read_with_all_its_numbers() -> None:
     assert all(
         submit.source is not None and submit.bundle_digest for submit in run.submits if submit.status == "ok"
     )
-    assert run.record.record_version == 4
+    assert run.record.record_version == 5
     assert run.record.versions.agents_md_hash.startswith("sha256:")
     assert run.record.artifacts.logs_agent == "logs/agent.jsonl"
 

@@ -155,7 +155,7 @@ async def test_splits_come_from_the_data_folder_where_one_is_named(tmp_path: Pat
                 await gateway.results(0)
                 await gateway.close()
             finished = await operator.finished(created.run)
-            assert not finished.split_secret
+            assert not finished.cases_secret
             assert len(finished.heldout_returns) == 2
             assert {spec.case.seed for job in worker.jobs for spec in job.episodes} == {2, 3, 4, 5}
             for settings in ({"env": "toy/maze"}, {"n_heldout": 3}, {"env": "no/such"}, {"budget": 0}):

@@ -52,7 +52,7 @@ async def test_run_goes_from_submit_to_feedback_to_held_out_score(coordinator: C
         assert finished.final_score == pytest.approx(sum(finished.heldout_returns) / 32)
         assert len(finished.random_heldout_returns) == 32
         assert set(finished.split_hashes) == {"train", "validation", "heldout"}
-        assert finished.split_secret
+        assert finished.cases_secret
         by_split = {spec.case.seed for job in worker.jobs for spec in job.episodes}
         assert len(by_split) == 3 + 16 + 32
     assert coordinator.stop() == 0

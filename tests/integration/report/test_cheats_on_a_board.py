@@ -51,7 +51,7 @@ def raised_rewards(forger: Forger) -> None:
     forger.raise_returns(lambda old: forger.returns("heldout-001"))
 
     def told(result: dict[str, Any]) -> None:
-        result["record"]["versions.fingerprint"]["cpu"] = "x86_64 SSE2"
+        result["fingerprint"]["cpu"] = "x86_64 SSE2"
 
     forger.begin_anew(told)
     another_processor(forger)

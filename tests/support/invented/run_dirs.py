@@ -7,7 +7,7 @@ import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from statistics import fmean, pstdev
-from typing import Any, Literal
+from typing import Any
 
 import msgspec
 
@@ -55,7 +55,6 @@ def write_run(
     split: str = "split-1",
     fingerprint: Mapping[str, str] | None = None,
     status: str | None = None,
-    seeded_by: Literal["case", "run"] = "run",
     closed_reason: str | None = None,
     settings: Mapping[str, Any] | None = None,
     change: Mapping[str, Any] | None = None,
@@ -125,9 +124,7 @@ def write_run(
             heldout_std_return=pstdev(heldout) if heldout else None,
             heldout_returns=tuple(heldout),
             random_reference=(
-                ReferenceScore(mean_return=random_mean, std_return=1.0, seeded_by=seeded_by)
-                if random_mean is not None
-                else None
+                ReferenceScore(mean_return=random_mean, std_return=1.0) if random_mean is not None else None
             ),
             closed_reason=closed_reason or ("budget_spent" if remaining == 0 else "agent_stopped"),
             budget_used=budget - remaining,

@@ -174,7 +174,7 @@ class Rig:
 
     def create(self, run: str = "r1", *, key: str | None = None, train: int = 64, n_valid: int = 2, n_held: int = 3,
                budget: int = 16, env: str = ENV, most: int = 16, least: int = 1, agent: str | None = "agents",
-               hidden_from: int = 1000, max_steps: int = 0, epoch: str = "e1", split_secret: bool = True, **settings: Any) -> Any:  # fmt: skip  # noqa: E501
+               hidden_from: int = 1000, max_steps: int = 0, epoch: str = "e1", cases_secret: bool = True, **settings: Any) -> Any:  # fmt: skip  # noqa: E501
         """Create a run; its agent gets a permit on kernel `agent`, of its own unless told otherwise, None for none."""
         reply = self.ask(
             operator.CreateRun,
@@ -191,10 +191,13 @@ class Rig:
             validation=tuple(Case(seed=hidden_from + seed) for seed in range(n_valid)),
             heldout=tuple(Case(seed=1000 + hidden_from + seed) for seed in range(n_held)),
             split_hashes={},
-            split_secret=split_secret,
+            cases_secret=cases_secret,
             epoch=epoch,
             salt=b"n" * 32,
             max_steps=max_steps,
+            policy_seeds="",
+            allowed_imports=(),
+            denied_imports=(),
         )
         if agent is not None and run in self.core.state.runs:
             self.permit(run, agent)

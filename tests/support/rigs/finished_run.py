@@ -7,10 +7,13 @@ from typing import Any
 
 from evopolicy_common.messages.episode import BlobRef
 from evopolicy_common.messages.gateway import EpisodeFeedback
-from evopolicy_common.messages.operator import RunFinished, SubmitRecord
+from evopolicy_common.messages.operator import Committed, RunFinished, SubmitResult
 from evopolicy_common.messages.run_settings import RunSettings
 from evopolicy_common.messages.worker import Fingerprint
+from evopolicy_common.records.account import run_record
+from evopolicy_common.records.run_record import RunRecord
 from evopolicy_gateway.run.plan import Plan
+from evopolicy_gateway.run.record import claims
 
 SETTINGS = RunSettings(env="toy/line", entry="evolve", model="none", exp_id="t", budget=8)
 
@@ -38,35 +41,54 @@ def finished(**fields: Any) -> RunFinished:
         "agent": {"turns": 2, "retries": 1, "settings": {"effort": "high"}, "tokens": None},
         "final_score": 2.0,
         "best_submit_index": 1,
-        "val_scores": {0: 1.0, 1: 1.5},
         "heldout_returns": (1.0, 3.0),
-        "validation_ineligible": {2: "brought its slot down"},
+        "validation_ineligible": (2,),
         "policy_failures": {"validation": 0, "heldout": 1},
         "random_heldout_returns": (0.0, 1.0),
-        "episode_budget": 8,
+        "budget": 8,
+        "min_episodes_per_submit": 1,
+        "max_episodes_per_submit": 8,
+        "n_train": 64,
+        "n_validation": 2,
+        "n_heldout": 2,
         "budget_used": 8,
         "split_hashes": {"train": "a", "validation": "b", "heldout": "c"},
-        "split_secret": True,
+        "cases_secret": True,
         "env_version": "line-1",
         "deterministic": True,
         "fingerprint": Fingerprint(code_version="1", python="3.11", packages={"numpy": "2.4"}, cpu="x"),
         "created_at": 100.0,
-        "closed_at": 110.0,
         "finished_at": 112.5,
-        "submits": (
-            SubmitRecord(
-                submit_index=0,
+        "submits": tuple(
+            SubmitResult(
+                submit_index=index,
                 status="ok",
                 bundle=None,
                 env_instances=(0,),
                 remaining_budget=0,
                 mean_return=1.0,
-                val_mean=1.0,
+                val_mean=val_mean,
                 started_at=101.0,
                 completed_at=102.0,
-            ),
+            )
+            for index, val_mean in enumerate((1.0, 1.5))
         ),
         "wall_s": {"queue": 0.5, "rollout": 3.0, "finalise": 2.5},
+        "n_overrides": 1,
         "fingerprint_overrides": ("a → b: the old workers are gone",),
+        "heldout_successes": (),
+        "infrastructure_retries": 0,
+        "nondeterministic_results": 0,
+        "env_title": "",
+        "env_family": "",
+        "installations": (),
+        "hidden_isolation": "unknown",
+        "record": {},
+        "committed": Committed(commitment="c", epoch="e1", opened=0, opened_head="h"),
     }
     return RunFinished(**usual | fields)
+
+
+def record_in(plan: Plan, done: RunFinished, **more: Any) -> RunRecord:
+    """The record of a run that the plan's command has played. `more`: of `claims`."""
+    return run_record(done, claims(plan, done.agent, **more))

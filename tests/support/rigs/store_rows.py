@@ -7,9 +7,11 @@ from typing import Any
 
 from evopolicy_common.messages.environment import Case
 from evopolicy_common.messages.episode import BlobRef, EpisodeOutcome
+from evopolicy_common.messages.operator import Committed
 from evopolicy_common.messages.run_settings import RunSettings
 from evopolicy_coordinator.core.contract.records import OutcomeRow, RunRow, RunStateRow, SubmitRow
 
+COMMITTED = Committed(commitment="c", epoch="e1", opened=0, opened_head="h")
 SETTINGS = RunSettings(env="toy/line", entry="tester", model="none", exp_id="t")
 
 
@@ -27,13 +29,19 @@ def run_row(run: str = "r-1", **changes: Any) -> RunRow:
         "validation": (Case(seed=3),),
         "heldout": (Case(seed=4),),
         "split_hashes": {},
-        "split_secret": True,
+        "cases_secret": True,
+        "policy_seeds": "",
+        "epoch": "e1",
+        "salt": b"n" * 32,
+        "max_steps": 0,
+        "allowed_imports": (),
+        "denied_imports": (),
     }
     return RunRow(**{**values, **changes})
 
 
 def state_row(run: str = "r-1", **changes: Any) -> RunStateRow:
-    return RunStateRow(run=run, **changes)
+    return RunStateRow(**{"run": run, "committed": COMMITTED, **changes})
 
 
 def submit_row(run: str = "r-1", submit_index: int = 0, **changes: Any) -> SubmitRow:

@@ -11,7 +11,7 @@ from typing import Any
 
 import msgspec
 import pytest
-from rigs.finished_run import finished, plan_in
+from rigs.finished_run import finished, plan_in, record_in
 
 from evopolicy_common.console import Terminal
 from evopolicy_common.messages.operator import ClaimState
@@ -22,8 +22,6 @@ from evopolicy_common.wire.credentials import Credentials
 from evopolicy_gateway.operator.cluster import Cluster as LocalCluster
 from evopolicy_gateway.processes.child_messages import AgentDoing
 from evopolicy_gateway.run.plan import Plan
-from evopolicy_gateway.run.record import run_record
-from evopolicy_gateway.run.times import Times
 from evopolicy_gateway.run_folder.layout import RunFolder
 from evopolicy_gateway.suite import runs, suite_index, sweep
 from evopolicy_gateway.suite.claimed import ClaimedSweep
@@ -73,10 +71,10 @@ class Cluster:
 
 def record_of(plan: Plan) -> RunRecord:
     """Of a completed run."""
-    scores: dict[str, Any] = {"final_score": 1.0, "best_submit_index": 0, "val_scores": {0: 1.0}}
+    scores: dict[str, Any] = {"final_score": 1.0, "best_submit_index": 0}
     returns: dict[str, Any] = {"heldout_returns": (1.0,), "random_heldout_returns": (0.0,)}
     done = finished(settings=plan.settings, agent={}, submits=(), wall_s={}, **scores, **returns)
-    return run_record(plan, done, None, [], Times())
+    return record_in(plan, done)
 
 
 def entry_of(plan: Plan, **more: Any) -> Entry:

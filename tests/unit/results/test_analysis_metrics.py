@@ -211,20 +211,9 @@ def test_tables_and_curves_use_one_random_reference(tmp_path: Path) -> None:
     assert [one.area for one in found.evolutions] == pytest.approx([(8 * 0.5 + 16) / 32] * 3)
 
 
-@pytest.mark.parametrize("newer_first", [True, False])
-def test_a_reference_seeded_by_case_replaces_those_of_earlier_versions(
-    tmp_path: Path, newer_first: bool
-) -> None:
-    names = ["A", "B", "C"] if newer_first else ["C", "B", "A"]
-    write_run(tmp_path, VERSIONS[:1], random_mean=-4.5, entry=names[0], seeded_by="case")
-    write_run(tmp_path, VERSIONS[:1], random_mean=-40.0, entry=names[1])
-    write_run(tmp_path, VERSIONS[:1], random_mean=-50.0, entry=names[2])
-    assert references(load_runs([tmp_path]).runs) == {"gym/acrobot": -4.5}
-
-
 def test_equal_references_stay_bit_for_bit_what_they_are(tmp_path: Path) -> None:
     for repeat in range(10):
-        write_run(tmp_path, VERSIONS[:1], random_mean=0.1, repeat=repeat, seeded_by="case")
+        write_run(tmp_path, VERSIONS[:1], random_mean=0.1, repeat=repeat)
     assert references(load_runs([tmp_path]).runs) == {"gym/acrobot": 0.1}
 
 

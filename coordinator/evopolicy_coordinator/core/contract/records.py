@@ -26,44 +26,26 @@ from evopolicy_common.messages.episode import (
 )
 from evopolicy_common.messages.gateway import SubmitDone, SubmitStatus
 from evopolicy_common.messages.operator import Committed, PlayedAs, RunFinished
-from evopolicy_common.messages.run_settings import HiddenIsolation, RunSettings
+from evopolicy_common.messages.run_settings import HiddenIsolation
 from evopolicy_common.messages.worker import Fingerprint
+from evopolicy_common.records.journal import Opening
 
 S = TypeVar("S", bound=msgspec.Struct)
 Phase = Literal["open", "closed", "finished"]
 
 
-class RunRow(msgspec.Struct, frozen=True, kw_only=True, tag="run"):
-    """A run as it was created; never changed. Key: `run`."""
+class RunRow(Opening, frozen=True, kw_only=True, tag="run"):
+    """A run as it was created, with what its opening commits to; never changed. Key: `run`."""
 
-    run: str
     key: str
     """The operator's idempotency key; unique."""
     capability: str
     """Token of the run's gateway."""
     secret: bytes
     """32 random bytes that policy seeds are derived from; never leaves the coordinator."""
-    settings: RunSettings
-    budget: int
-    """Train episodes granted."""
-    min_episodes_per_submit: int
-    max_episodes_per_submit: int
-    train: tuple[Case, ...]
-    validation: tuple[Case, ...]
-    heldout: tuple[Case, ...]
     split_hashes: dict[str, str]
-    split_secret: bool
-    allowed_imports: tuple[str, ...] = ()
-    denied_imports: tuple[str, ...] = ()
-    max_steps: int = 0
-    """Steps after which an episode is truncated; 0: only its environment ends it."""
-    epoch: str = ""
-    """Of the cases."""
-    trials: str = ""
-    """As in `journal.Opening`."""
-    salt: bytes = b""
+    salt: bytes
     """32 random bytes; of the commitment."""
-    committed: Committed | None = None
     created_at: float = 0.0
     """Unix time, seconds (so are all `*_at`)."""
     stimulus_id: str = ""
@@ -75,6 +57,7 @@ class RunStateRow(msgspec.Struct, frozen=True, kw_only=True, tag="run_state"):
     """The changing part of a run. Key: `run`."""
 
     run: str
+    committed: Committed
     phase: Phase = "open"
     fingerprint_class: str | None = None
     """The class of workers that the run is pinned to; None until a worker offers its environment."""
@@ -124,8 +107,8 @@ class SubmitRow(msgspec.Struct, frozen=True, kw_only=True, tag="submit"):
     """Visible mean return; None unless ok."""
     val_mean: float | None = None
     """Hidden validation mean; None until every validation case is done."""
-    ineligible: str | None = None
-    """Why the checkpoint cannot be selected; None if it can."""
+    ineligible: bool = False
+    """With `failed_episodes` = "end-submit", its policy failed in validation: it cannot be selected."""
     held_s: float = 0.0
     """Seconds for which none of its episodes ran because hidden jobs occupied the machines."""
     tree: str = ""

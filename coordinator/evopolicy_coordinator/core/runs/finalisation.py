@@ -8,7 +8,6 @@ Rules that this module owns:
   submit.
 - With `failed_episodes` = "end-submit", a checkpoint whose policy fails in a validation episode is not eligible, and a
   run whose selected policy fails in a held-out episode ends as an error.
-- A checkpoint that an earlier version found ineligible stays so; only the finished run's result reports it.
 - The selected checkpoint plays all held-out cases; uniform random actions play the same ones. Those actions follow from
   split and case (`jobs.reference_seed`).
 - The stage follows from stored rows: `advance` may be called any number of times.
@@ -39,9 +38,6 @@ from evopolicy_coordinator.core.tables.step import (
     SubmitEnded,
 )
 
-FAILED_VALIDATION = "its policy failed in a validation episode"
-"""`SubmitRow.ineligible` of a checkpoint with "end-submit"."""
-
 # ---- hidden groups ----
 
 
@@ -57,7 +53,7 @@ def progressed(state: State, news: EpisodesDone, step: Step) -> None:
     run = state.runs[group.run]
     run.hidden_failures[group.id] = group.failed()
     if group.kind == "validation" and finished.fails(run, group.failed()):
-        step.change_submit(run, group.submit_index, ineligible=FAILED_VALIDATION)
+        step.change_submit(run, group.submit_index, ineligible=True)
     elif group.kind == "validation":
         step.change_submit(run, group.submit_index, val_mean=group.mean_return())
     else:
@@ -104,7 +100,7 @@ def advance(state: State, run: Run, step: Step) -> None:
     has_reference = random_group(run.id) in run.hidden_returns
     if not has_reference:
         _open(state, templates.random(run, step), step)
-    waiting = [row for row in finished.ok_submits(run) if row.val_mean is None and row.ineligible is None]
+    waiting = [row for row in finished.ok_submits(run) if row.val_mean is None and not row.ineligible]
     for row in waiting:
         _open(state, templates.hidden("validation", run, row, step), step)
     if waiting:

@@ -13,7 +13,6 @@ from evopolicy_coordinator.core.contract.reasons import Reason
 from evopolicy_coordinator.core.contract.records import (
     SubmitRow,
     random_group,
-    shared,
     submit_group,
 )
 from evopolicy_coordinator.core.runs import waits
@@ -44,7 +43,7 @@ def select(run: Run) -> SubmitRow | None:
     means = {
         row.submit_index: row.val_mean
         for row in ok_submits(run)
-        if row.ineligible is None and row.val_mean is not None
+        if not row.ineligible and row.val_mean is not None
     }
     best = best_validated(means, run.row.settings.profile)
     return None if best is None else run.submits[best]
@@ -65,10 +64,8 @@ def result(
             f"the run ended ({stored.close_reason.replace('_', ' ')}) with {n_unspent} of its {row.budget}"
             " episodes left, and must spend them (finish = budget)"
         )
-    elif not ok or (best is None and row.settings.failed_episodes == "end-submit"):
-        status = "no_ok_submit"
     elif best is None:
-        status, error = "error", "no ok checkpoint is eligible: each brought its slots down while hidden"
+        status = "no_ok_submit"
     elif fails(run, failed := run.hidden_failures.get(submit_group(run.id, best.submit_index, "heldout"), 0)):
         status = "error"
         error = (
@@ -89,40 +86,66 @@ def result(
             "heldout": run.hidden_failures.get(submit_group(run.id, index, "heldout"), 0),
         }
     description = stored.description
+    told = stored.agent.get("record", {})
     closed_at = now if stored.closed_at is None else stored.closed_at
-    return shared(
-        operator.RunFinished,
-        row,
-        stored,
+    return operator.RunFinished(
+        run=run.id,
+        settings=row.settings,
         status=status,
         error=error,
         closed_reason=stored.close_reason,
+        agent={name: fact for name, fact in stored.agent.items() if name != "record"},
+        record=told if isinstance(told, dict) else {},
         final_score=final_score,
         best_submit_index=None if best is None else best.submit_index,
-        val_scores={each.submit_index: each.val_mean for each in ok if each.val_mean is not None},
         heldout_returns=heldout,
         heldout_successes=successes,
-        validation_ineligible={
-            each.submit_index: each.ineligible for each in ok if each.ineligible is not None
-        },
+        validation_ineligible=tuple(each.submit_index for each in ok if each.ineligible),
         policy_failures=failures,
         random_heldout_returns=run.hidden_returns.get(random_group(run.id), ()),
-        episode_budget=row.budget,
+        budget=row.budget,
+        min_episodes_per_submit=row.min_episodes_per_submit,
+        max_episodes_per_submit=row.max_episodes_per_submit,
+        n_train=len(row.train),
+        n_validation=len(row.validation),
+        n_heldout=len(row.heldout),
         budget_used=run.ledger.settled,
+        split_hashes=row.split_hashes,
+        cases_secret=row.cases_secret,
         env_version="" if description is None else description.env_version,
         deterministic=True if description is None else description.deterministic,
         env_title="" if description is None else description.title,
         env_family="" if description is None else description.family,
-        closed_at=closed_at,
+        fingerprint=stored.fingerprint,
+        created_at=row.created_at,
         finished_at=now,
         submits=tuple(
-            shared(operator.SubmitRecord, each, started_at=each.accepted_at)
+            operator.SubmitResult(
+                submit_index=each.submit_index,
+                status=each.status,
+                bundle=each.bundle,
+                env_instances=each.env_instances,
+                remaining_budget=each.remaining_budget,
+                mean_return=each.mean_return,
+                val_mean=each.val_mean,
+                started_at=each.accepted_at,
+                completed_at=each.completed_at,
+                tree=each.tree,
+            )
             for each in run.submits
-            if each.env_instances and not each.refunded
+            if each.env_instances
+            and not each.refunded
+            and each.status is not None
+            and each.completed_at is not None
         ),
         wall_s={"queue": run.queue_s, "rollout": run.rollout_s, "finalise": max(0.0, now - closed_at)},
+        infrastructure_retries=stored.infrastructure_retries,
+        nondeterministic_results=stored.nondeterministic_results,
         hidden_isolation=stored.isolation,
+        n_overrides=len(stored.overrides),
         fingerprint_overrides=stored.overrides,
+        committed=stored.committed,
+        installations=stored.installations,
     )
 
 
@@ -154,7 +177,7 @@ def progress(state: State, run: Run) -> tuple[operator.RunProgress, Reason | Non
         if run.state.description is None:  # its gateway cannot serve yet
             waits_for = waits.waits_for_workers(state, run.flow)
         return operator.RunProgress(phase="open", done=done, total=run.row.budget), waits_for
-    ok = [row for row in ok_submits(run) if row.ineligible is None]
+    ok = [row for row in ok_submits(run) if not row.ineligible]
     n = len(run.row.validation)
     groups = [state.groups.get(submit_group(run.id, row.submit_index, "validation")) for row in ok]
     done = sum(n if group is None else group.done for group in groups)

@@ -9,55 +9,52 @@ Rules that this module owns:
 
 from __future__ import annotations
 
-import hashlib
-
 import msgspec
 
 from evopolicy_common.messages.operator import Committed, Done, RunFinished
 from evopolicy_common.records import journal
 from evopolicy_coordinator.core.contract import events
 from evopolicy_coordinator.core.contract.reasons import NotDoneError
-from evopolicy_coordinator.core.contract.records import DocumentRow, JournalRow, RunRow, shared
+from evopolicy_coordinator.core.contract.records import DocumentRow, JournalRow, RunRow
 from evopolicy_coordinator.core.tables.state import State
 from evopolicy_coordinator.core.tables.step import Step
 
 
 def check_epoch(state: State, row: RunRow) -> None:
     """Raises NotDoneError when no run may be opened on these cases."""
-    if row.split_secret and row.epoch in state.revealed and not row.settings.replay_of:
+    if row.cases_secret and row.epoch in state.revealed and not row.settings.replay_of:
         raise NotDoneError("epoch_revealed", epoch=row.epoch)
 
 
-def opened(state: State, row: RunRow, step: Step) -> RunRow:
-    """Commit to a run that is about to be created. Returns its row with the commitment's place in the journal."""
-    settings = row.settings
-    document = journal.document(
-        shared(
-            journal.Opening,
-            row,
-            # This document is published unchanged, so it leaves out the operator's private labels and machine.
-            settings=msgspec.structs.replace(settings, notes={}, agent_host=""),
-            cases_secret=row.split_secret,
-            policy_seeds=hashlib.sha256(row.secret).hexdigest(),
-        )
-    )
+def opened(state: State, row: RunRow, step: Step) -> Committed:
+    """Commit to a run that is about to be created."""
+    opening = journal.Opening(**{name: getattr(row, name) for name in journal.Opening.__struct_fields__})
+    # The document is published unchanged, so it leaves out the operator's private labels and machine.
+    settings = msgspec.structs.replace(row.settings, notes={}, agent_host="")
+    document = journal.document(msgspec.structs.replace(opening, settings=settings))
     commitment = journal.commitment(row.salt, document)
     step.persist(DocumentRow(run=row.run, kind="opening", data=document))
-    last = _append(
-        state,
-        shared(journal.Opened, row, settings, commitment=commitment, at=step.now),
-        step,
+    entry = journal.Opened(
+        run=row.run,
+        commitment=commitment,
+        epoch=row.epoch,
+        entry=settings.entry,
+        model=settings.model,
+        env=settings.env,
+        exp_id=settings.exp_id,
+        repeat=settings.repeat,
+        attempt=settings.attempt,
+        at=step.now,
+        replay_of=settings.replay_of,
+        start=settings.start,
     )
-    place = Committed(commitment=commitment, epoch=row.epoch, opened=last.seq, opened_head=last.head)
-    return msgspec.structs.replace(row, committed=place)
+    last = _append(state, entry, step)
+    return Committed(commitment=commitment, epoch=row.epoch, opened=last.seq, opened_head=last.head)
 
 
 def ended(state: State, finished: RunFinished, step: Step) -> RunFinished:
-    """Commit to a run's result. A run without an opening commitment gets no entry, since the entry could
-    not refer to its start."""
-    if finished.committed is None:
-        return finished
-    document = journal.document(journal.result_of(finished))
+    """Commit to a run's result."""
+    document = journal.document(finished.result)
     step.persist(DocumentRow(run=finished.run, kind="result", data=document))
     entry = journal.Ended(
         run=finished.run, status=finished.status, result=journal.digest(document), at=step.now

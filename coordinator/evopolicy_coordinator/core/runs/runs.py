@@ -40,13 +40,9 @@ def create(state: State, event: events.RunCreated, step: Step) -> None:
     journal.check_epoch(state, row)
     if row.run in state.capabilities:
         raise NotDoneError("run_exists", run=row.run)
-    row = msgspec.structs.replace(
-        row,
-        created_at=step.now,
-        stimulus_id=step.stimulus_id,
-    )
-    row = journal.opened(state, row, step)
-    stored = RunStateRow(run=row.run, isolation=requests.stamp(state, row))
+    row = msgspec.structs.replace(row, created_at=step.now, stimulus_id=step.stimulus_id)
+    committed = journal.opened(state, row, step)
+    stored = RunStateRow(run=row.run, committed=committed, isolation=requests.stamp(state, row))
     step.persist(row)
     run = enter(state, row, stored)
     step.persist(stored)

@@ -11,6 +11,7 @@ import pytest
 from evopolicy_common.errors import ProtocolError
 from evopolicy_common.records.policies.checkpoints import read_meta
 from evopolicy_common.records.run_record import (
+    RECORD_VERSION,
     Agent,
     ExperimentDimensions,
     Outcome,
@@ -107,8 +108,8 @@ def test_file_of_a_newer_version_is_refused_by_name() -> None:
     for newer in (
         {"schema_version": 2},
         {"schema_version": "0.2"},
-        {"record_version": 3},
-        {"record_version": 5},
+        {"record_version": RECORD_VERSION - 1},
+        {"record_version": RECORD_VERSION + 1},
     ):
         with pytest.raises(ProtocolError, match=r"run\.json has schema_version .*use the version"):
             decode_run_record(json.dumps(document | newer).encode())

@@ -51,7 +51,7 @@ def test_a_failed_validation_episode_excludes_the_checkpoint() -> None:
     finished = one_submit("validation").finished()
     assert (finished.status, finished.best_submit_index, finished.val_scores) == ("no_ok_submit", None, {})
     assert finished.submits[0].status == "ok"
-    assert list(finished.validation_ineligible) == [0]
+    assert finished.validation_ineligible == (0,)
 
 
 def test_a_failed_heldout_episode_leaves_the_run_without_a_score() -> None:
@@ -64,7 +64,7 @@ def test_an_excluded_checkpoint_stays_excluded_after_a_restart(rig: Rig) -> None
     session = rig.begin(0, 1, run={"failed_episodes": "end-submit", "budget": 2, "n_held": 9})
     play_off(rig, session, lambda job: (1.0, False))
     rig.close()
-    while rig.row(SubmitRow, "r1", 0).ineligible is None:
+    while rig.row(SubmitRow, "r1", 0).ineligible is False:
         for lease in rig.poll(session, 8):
             failure = FAILURE if split_of(lease.job) == "validation" else None
             rig.report_results(session, done(lease, 1.0, failure))

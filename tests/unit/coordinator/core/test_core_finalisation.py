@@ -10,15 +10,15 @@ import pytest
 from hypothesis import given, settings
 from rigs import core_rig
 from rigs.asking import asked
-from rigs.core_rig import BUNDLE, Rig, done, key_of, split_of
+from rigs.core_rig import BUNDLE, Rig, done, split_of
 
-from evopolicy_common.messages import gateway, operator
+from evopolicy_common.messages import operator
 from evopolicy_common.messages.environment import Case
 from evopolicy_common.messages.episode import Job, ResourceLimits
 from evopolicy_common.messages.operator import EvaluationStarted, RunProgress
 from evopolicy_common.messages.run_settings import PUBLISHED
 from evopolicy_coordinator.core.contract.effects import ReadEvaluation
-from evopolicy_coordinator.core.contract.records import EvaluationRow, RunRow, SubmitRow
+from evopolicy_coordinator.core.contract.records import EvaluationRow, RunRow
 from evopolicy_coordinator.server.reason_texts import words
 
 
@@ -108,35 +108,6 @@ def test_random_actions_outside_a_run_are_the_reference_of_their_split(rig: Rig)
     ask(rig, bundle=None, split="heldout", case_ids=tuple(range(3)), cases=heldout)
     leases = rig.poll(session, 3)
     assert sorted(each.job.episodes[0].policy_seed for each in leases) == sorted(reference)
-
-
-def found_ineligible(rig: Rig, index: int) -> None:
-    """As a coordinator of an earlier version stored it, which goes on with this one."""
-    row = rig.row(SubmitRow, "r1", index)
-    rig.rows[key_of(row)] = msgspec.structs.replace(row, ineligible="brought its slot down")
-    rig.load()
-
-
-def test_a_checkpoint_found_ineligible_earlier_stays_so_and_only_the_end_tells(rig: Rig) -> None:
-    """Attack: sleeps or crashes on hidden cases to make its agent's submits wait or fail. Defence: hidden
-    cases are played after the run has closed; their outcomes stay secret until the end."""
-    session = rig.begin(0, worker={"slots": 8}, run={"n_valid": 1})
-    rig.play(session, *rig.poll(session, 8))
-    before = rig.ask(gateway.StateRequest, run="r1")
-    found_ineligible(rig, 0)
-    assert rig.ask(gateway.StateRequest, run="r1") == before
-    finished = rig.finish(rig.register(slots=8))
-    assert (finished.status, list(finished.validation_ineligible)) == ("error", [0])
-
-
-def test_a_checkpoint_found_ineligible_on_held_out_gives_way_to_the_next(rig: Rig) -> None:
-    session = rig.register(slots=8)
-    two_submits(rig, session)
-    rig.work_off(session, value_of)
-    found_ineligible(rig, 1)
-    finished = rig.finish(rig.register(slots=8), value_of)
-    assert (finished.status, finished.best_submit_index) == ("completed", 2)
-    assert list(finished.validation_ineligible) == [1]
 
 
 def test_hidden_jobs_tell_a_policy_nothing_of_the_split_they_are_from(rig: Rig) -> None:

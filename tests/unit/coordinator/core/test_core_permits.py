@@ -6,9 +6,7 @@ from __future__ import annotations
 from collections import Counter
 from typing import Any
 
-import msgspec
 import pytest
-from rigs.asking import asked
 from rigs.core_rig import Rig, describe, fingerprint, result, split_of
 
 from evopolicy_common.messages import gateway, operator
@@ -306,14 +304,6 @@ def test_an_operators_word_ends_a_permit_and_silence_does_not(rig: Rig) -> None:
     assert gone(rig, "nobody").status == Refusal.UNKNOWN_RUN
 
 
-def earlier_version(rig: Rig, message: type[wire.Message], **fields: Any) -> Any:
-    """A request with `machine_id`, a field of earlier versions, from which they concluded that a machine was
-    restarted."""
-    given = asked(message, request=rig.request(), **fields)
-    sent = {**msgspec.to_builtins(given.message), "machine_id": "m"}
-    return rig.tell(msgspec.structs.replace(given, message=msgspec.convert(sent, message)))
-
-
 @pytest.mark.parametrize("by", ["its own gateway", "another gateway", "another worker", "its own worker"])
 def test_no_report_of_another_boot_id_ends_a_permit(rig: Rig, by: str) -> None:
     """Attack: the gateway of another run, or a worker, reports a new boot id of the agent's machine, as if
@@ -322,16 +312,14 @@ def test_no_report_of_another_boot_id_ends_a_permit(rig: Rig, by: str) -> None:
     session = scored(rig)
     for run in ("r1", "r2"):
         rig.create(run, agent=None)
-    earlier_version(rig, gateway.RequestPermit, run="r1", boot_id=HERE, host="lab")
+    rig.ask(gateway.RequestPermit, run="r1", boot_id=HERE, host="lab")
     if "gateway" in by:
         run = "r1" if by == "its own gateway" else "r2"
-        assert earlier_version(rig, gateway.RequestPermit, run=run, boot_id="fake", host="lab").granted
+        assert rig.ask(gateway.RequestPermit, run=run, boot_id="fake", host="lab").granted
     else:
         name = "w1" if by == "its own worker" else "w2"
         described = {"tiers": ("bwrap",), "environments": (describe(),), "fingerprint": fingerprint()}
-        earlier_version(
-            rig, wire.Register, worker=name, session=f"{name}-x", slots=8, boot_id="fake", **described
-        )
+        rig.ask(wire.Register, worker=name, session=f"{name}-x", slots=8, boot_id="fake", **described)
         session = rig.register("w3", slots=8, boot_id=HERE)
     assert rig.row(PermitRow, "r1", HERE).ended_at is None
     assert "validation" not in splits(rig.poll(session, 8))

@@ -117,7 +117,7 @@ def test_run_takes_its_numbers_and_cases_from_its_suite(parser: RequestParser) -
         128,
     )
     assert (len(made.row.train), len(made.row.validation), len(made.row.heldout)) == (64, 16, 32)
-    assert made.row.split_secret
+    assert made.row.cases_secret
     assert len(made.row.secret) == 32
     assert keys.valid_name(made.row.run)
     assert (made.row.allowed_imports, made.row.denied_imports) == (("numpy",), ("gymnasium",))
@@ -404,7 +404,7 @@ def test_profile_published_plays_published_files_or_not_at_all(tmp_path: Path) -
     whole = at(published_tree(tmp_path / "whole", 1024))
     made = event(whole, OPS, create(**published))
     assert (len(made.row.train), len(made.row.validation), len(made.row.heldout)) == (1024, 16, 32)
-    assert not made.row.split_secret
+    assert not made.row.cases_secret
     assert "start it with --data" in refused(at(None), OPS, create(**published)).message
     short = at(published_tree(tmp_path / "short", 64))
     assert "1,024 cases each" in refused(short, OPS, create(**published)).message

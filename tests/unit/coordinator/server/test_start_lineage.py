@@ -123,15 +123,16 @@ async def test_a_start_from_an_ended_run_hands_its_stamp_on(tmp_path: Path) -> N
 
 
 TOLD: tuple[tuple[dict[str, Any], tuple[str, str]], ...] = (
-    ({"jail": "bwrap", "agent.model_use": {"metering": "relay"}}, ("bwrap", "relay")),
-    ({"jail": "none", "agent.model_use": None, "agent.model_string": "m"}, ("none", "unknown")),
+    ({"jail": "bwrap", "agent": {"model_use": {"metering": "relay"}}}, ("bwrap", "relay")),
+    ({"jail": "none", "agent": {"model_use": None, "model_string": "m"}}, ("none", "unknown")),
     (
-        {"jail": "bwrap, open network", "agent.model_use": {"metering": "agent"}},
+        {"jail": "bwrap, open network", "agent": {"model_use": {"metering": "agent"}}},
         ("bwrap, open network", "agent"),
     ),
     ({"jail": "bwrap"}, ("bwrap", "nothing")),
-    ({"jail": ["bwrap"], "agent.model_use": {"metering": 7}}, ("unknown", "unknown")),
-    ({"jail": "bwrap as ever", "agent.model_use": "relay"}, ("unknown", "nothing")),
+    ({"jail": ["bwrap"], "agent": {"model_use": {"metering": 7}}}, ("unknown", "unknown")),
+    ({"jail": "bwrap as ever", "agent": {"model_use": "relay"}}, ("unknown", "nothing")),
+    ({"agent": "evolve"}, ("unknown", "nothing")),
     ({}, ("unknown", "nothing")),
 )
 

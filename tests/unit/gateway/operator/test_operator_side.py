@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from invented.policies import Version
 from invented.run_dirs import write_run
-from rigs.finished_run import finished, plan_in
+from rigs.finished_run import finished, plan_in, record_in
 
 from evopolicy_common.errors import ConfigError, ProtocolError
 from evopolicy_common.messages.episode import LARGEST_LIMIT, LARGEST_LIMITS, ResourceLimits
@@ -26,7 +26,7 @@ from evopolicy_gateway.operator.cluster import Cluster
 from evopolicy_gateway.operator.trials import policy_bundle
 from evopolicy_gateway.processes import child_messages
 from evopolicy_gateway.processes.child_messages import Progress
-from evopolicy_gateway.run.record import run_record
+from evopolicy_gateway.run import record
 from evopolicy_gateway.run.run_options import (
     ClusterOptions,
     RunOptions,
@@ -64,8 +64,7 @@ def test_packages_that_somebody_elses_run_names_are_refused_with_its_file(tmp_pa
     assert packages_for(policy, ["scipy"]) == ("scipy",)
 
 
-COUNTS = {"n_train": 64, "min_episodes_per_submit": 1, "max_episodes_per_submit": 8}
-STAGED = Staged(agents_md_hash="h", initial_policy_hash="i", **COUNTS)
+STAGED = Staged(agents_md_hash="h", initial_policy_hash="i")
 
 
 def test_a_completed_run_is_recorded_with_all_its_numbers(tmp_path: Path) -> None:
@@ -75,7 +74,8 @@ def test_a_completed_run_is_recorded_with_all_its_numbers(tmp_path: Path) -> Non
     ]
     times = Times(open_s=9.0, in_flight_s=4.0, feedback_s=0.5)
     counted = {"steps": 10, "action_invalid": 3}
-    record = run_record(plan_in(tmp_path), finished(), STAGED, rejected, times, transitions=counted)
+    known: dict[str, Any] = {"staged": STAGED, "rejected": rejected, "times": times, "transitions": counted}
+    record = record_in(plan_in(tmp_path), finished(), **known)
     assert record.outcome.auxiliary["transitions"] == {"steps": 10, "action_invalid": 3}
     assert decode_run_record(encode_run_record(record)) == record
     assert record.outcome.final_score == record.outcome.heldout_mean_return == 2.0
@@ -96,20 +96,42 @@ def test_a_completed_run_is_recorded_with_all_its_numbers(tmp_path: Path) -> Non
 
 def test_an_environment_that_does_not_repeat_itself_is_marked_in_the_record(tmp_path: Path) -> None:
     for deterministic in (True, False):
-        record = run_record(plan_in(tmp_path), finished(deterministic=deterministic), STAGED, [], Times())
+        record = record_in(plan_in(tmp_path), finished(deterministic=deterministic))
         assert record.versions.env_deterministic is deterministic
 
 
 @pytest.mark.parametrize("status", ["no_ok_submit", "error", "cancelled"])
 def test_a_run_without_a_result_has_no_score(tmp_path: Path, status: str) -> None:
     done = finished(status=status, final_score=None, best_submit_index=None, heldout_returns=(), submits=())
-    outcome = run_record(plan_in(tmp_path), done, None, [], Times()).outcome
+    outcome = record_in(plan_in(tmp_path), done).outcome
     assert outcome.status == status
     assert outcome.final_score == (0.0 if status == "no_ok_submit" else None)
     assert outcome.score is None
     assert outcome.val_scores is None
     assert outcome.heldout_returns == ()
-    assert (outcome.error is not None) == (status == "cancelled")
+
+
+@pytest.mark.parametrize(
+    ("why", "status", "error"),
+    [
+        (None, "cancelled", record.CANCELLED),
+        (record.INTERRUPTED, "cancelled", record.INTERRUPTED),
+        ("the agent's folder is gone", "error", "the agent's folder is gone"),
+    ],
+)
+async def test_a_cancelled_run_has_its_reason_as_error(
+    tmp_path: Path, why: str | None, status: str, error: str
+) -> None:
+    plan = plan_in(tmp_path)
+    plan.claim()
+    done = finished(
+        status="cancelled", final_score=None, best_submit_index=None, heldout_returns=(), submits=()
+    )
+    plan.folder.harness_log.parent.mkdir()
+    operations: Any = None  # nothing is fetched without a submit
+    written = await record.write(plan.folder, plan, done, operations, Times(), [].append, why)
+    assert (written.outcome.status, written.outcome.error) == (status, error)
+    assert decode_run_record(plan.folder.run_json.read_bytes()) == written
 
 
 @pytest.mark.parametrize(
@@ -119,7 +141,7 @@ def test_a_taken_folder_says_what_kind_of_run_it_holds(tmp_path: Path, status: s
     plan = plan_in(tmp_path)
     plan.claim()
     done = finished(status=status, final_score=None, best_submit_index=None, heldout_returns=(), submits=())
-    record = run_record(plan, done, None, [], Times())
+    record = record_in(plan, done)
     plan.folder.run_json.write_bytes(encode_run_record(record))
     with pytest.raises(ConfigError, match=f"holds {named} run; choose another --exp-id"):
         plan.claim()

@@ -11,14 +11,13 @@ from typing import Any
 import msgspec
 import numpy as np
 import pytest
-from rigs.finished_run import finished, plan_in
+from rigs.finished_run import finished, plan_in, record_in
 
 from evopolicy_common.console import Terminal
 from evopolicy_common.messages.run_settings import RunSettings
 from evopolicy_common.records.run_record import RunRecord
 from evopolicy_common.records.suite_folder import Entry, Index
 from evopolicy_gateway.run.plan import Plan
-from evopolicy_gateway.run.record import run_record
 from evopolicy_gateway.run.times import Times
 from evopolicy_gateway.suite import suite_index
 from evopolicy_gateway.suite.runs import PlayedRuns, documents, report
@@ -86,7 +85,6 @@ NEVER_PLAYED = {
     "best_submit_index": None,
     "closed_reason": "agent_failed",
     "budget_used": 0,
-    "val_scores": {},
     "heldout_returns": (),
     "submits": (),
 }
@@ -98,7 +96,7 @@ def one_run(root: Path, **fields: Any) -> tuple[Plan, RunRecord]:
     (plan,) = expand(read(str(path)), root / "runs", root)
     for index in range(3):
         (plan.folder.checkpoints / f"submit_{index:03d}").mkdir(parents=True)
-    return plan, run_record(plan, finished(settings=plan.settings, **fields), None, [], Times(open_s=9.0))
+    return plan, record_in(plan, finished(settings=plan.settings, **fields), times=Times(open_s=9.0))
 
 
 def test_the_index_keeps_its_bytes(tmp_path: Path) -> None:

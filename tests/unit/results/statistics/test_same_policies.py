@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 from invented.policies import Version, policy
 from invented.run_dirs import write_run
+from rigs.finished_run import finished
 
-from evopolicy_common.records.journal import Result, SubmitResult
+from evopolicy_common.messages.operator import SubmitResult
 from evopolicy_common.records.policies import checkpoints
 from evopolicy_common.records.run_record import decode_run_record
 from evopolicy_results.leaderboard.bundles import LabBundle, LabRun
@@ -153,23 +154,16 @@ def test_a_card_names_equal_repeats(tmp_path: Path, gains: tuple[float, ...], ov
             status="ok",
             bundle=bundle,
             env_instances=(0,),
+            remaining_budget=0,
             mean_return=-200.0,
             val_mean=-180.0,
+            started_at=1.0,
+            completed_at=2.0,
         )
-        result = Result(
-            run=f"r-{number}",
-            status="completed",
-            best_submit_index=0,
-            final_score=record.outcome.score,
-            heldout_returns=record.outcome.heldout_returns,
-            random_heldout_returns=(),
-            validation_ineligible=(),
-            policy_failures={},
-            budget_used=1,
-            infrastructure_retries=0,
-            nondeterministic_results=0,
-            submits=(submit,),
-        )
+        returns = record.outcome.heldout_returns
+        result = finished(
+            run=f"r-{number}", best_submit_index=0, heldout_returns=returns, submits=(submit,)
+        ).result
         sources.append(cards.Source(f"runs/{number:04d}", record, result))
     card = cards.make(sources, [], signer="", software="")
     assert card.results[0].over == over
