@@ -173,9 +173,7 @@ def claims(
     """What this side knows of a run; pure. `facts`: about the agent. `staged` None: no workspace. `more`: of
     `Claims`."""
     if staged is not None:
-        more["agents_md_hash"] = sha256_text(staged.agents_md_file_hash)
-        more["rules_hash"] = sha256_text(staged.agents_md_hash)
-        more["initial_policy_hash"] = sha256_text(staged.initial_policy_hash)
+        more |= {name: sha256_text(digest) for name, digest in msgspec.structs.asdict(staged).items()}
     return Claims(
         agent=_agent(plan, facts, times),
         jail=plan.jail.recorded,

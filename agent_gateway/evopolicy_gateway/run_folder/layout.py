@@ -139,9 +139,9 @@ class Staged(msgspec.Struct, frozen=True, kw_only=True):
     """The initial contents of a workspace, for `run.json`. Hashes are SHA-256, hex."""
 
     agents_md_hash: str
-    """Of the rules, with placeholders for the URLs: equal for runs with equal rules."""
-    agents_md_file_hash: str = ""
-    """Of `AGENTS.md`; empty in a workspace of an earlier version."""
+    """Of `AGENTS.md`."""
+    rules_hash: str
+    """Of `AGENTS.md` with placeholders for the URLs: equal for runs with equal rules."""
     initial_policy_hash: str
     """Of `system/policy.py`."""
 

@@ -41,8 +41,8 @@ def stage(folder: RunFolder, run: RunOpened, urls: Urls, text: str = "") -> Stag
     rules = agents_md(run, urls, text, started=started).encode()
     write_atomically(folder.agents_md, rules, mode=0o444)
     staged = Staged(
-        agents_md_hash=digest_of(agents_md(run, NO_URLS, text, started=started).encode()),
-        agents_md_file_hash=digest_of(rules),
+        rules_hash=digest_of(agents_md(run, NO_URLS, text, started=started).encode()),
+        agents_md_hash=digest_of(rules),
         initial_policy_hash=digest_of(policy),
     )
     save(folder.staged, staged)

@@ -33,7 +33,7 @@ class TokenUse(msgspec.Struct, frozen=True, kw_only=True):
     cost: float | None
     """US dollars per run; None when any of the runs has no price."""
     metering: str = ""
-    """The counter: `relay`, `agent`, or both in different runs; empty in files of earlier versions."""
+    """The counter: `relay`, `agent`, or both in different runs; empty where nothing counted."""
     hosted_tools: str = ""
     """Kinds of tools of the provider that requests offered to the model."""
     differing: int = 0

@@ -4,7 +4,7 @@
     signature.json             key and signature of the manifest's SHA-256
     journal.jsonl              all entries of the coordinator's journal, a line each, as they were hashed
     removed.json               what was taken out before publication
-    card.json, card.md         the evaluation card; files of earlier versions have neither these nor the next
+    card.json, card.md         the evaluation card
     croissant.json             what the files hold, for catalogues of data sets
     runs/0000/digests.json     digests of the files beside it: one run can be checked without the others
     runs/0000/run.json         the run's record

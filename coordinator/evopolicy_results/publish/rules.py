@@ -234,8 +234,8 @@ def _history_fault(entries: Sequence[journal.Entry]) -> str | None:
 
 
 def _descriptions(files: Files, manifest: Manifest, digests: Mapping[str, str], checked: Checked) -> None:
-    """Makes the card and its descriptions again, and compares. Files of earlier versions have none."""
-    if checked.failed or not files.names.intersection(contents.DESCRIPTIONS):
+    """Makes the card and its descriptions again, and compares."""
+    if checked.failed:
         return
     try:
         data = {name: files.read(name, contents.MAX_DOCUMENT_BYTES) for name in contents.DESCRIPTIONS}

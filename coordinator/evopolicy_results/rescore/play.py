@@ -97,8 +97,6 @@ def read_finished(folders: Sequence[Path]) -> tuple[list[Finished], list[str], l
             unreadable.append(f"{folder}: {record}")
         elif record.outcome.status != "completed" or record.outcome.best_submit_index is None:
             without.append(f"{folder}: {in_words(record.outcome.status)}, without a selected checkpoint")
-        elif not record.run:
-            without.append(f"{folder}: an earlier version wrote it without the coordinator's name of the run")
         else:
             selected = record.outcome.best_submit_index
             finished.append(Finished(folder=folder, record=record, selected=selected))

@@ -100,7 +100,7 @@ def _short(run: str) -> str:
 
 
 def _journal(run: Run) -> str | None:
-    """None for runs from before the journal existed."""
+    """None for runs of the published software."""
     place = run.record.committed
     return None if place is None or place.ended is None else f"{place.ended} {place.ended_head[:16]}"
 
@@ -303,8 +303,8 @@ def _audit(runs: Iterable[Run]) -> Table:
         name="audit",
         title="Audit signals",
         caption="One row a run. Invalid submits: accepted ones that are not ok, of all accepted. Repaired"
-        " actions: share of the train steps whose action was outside the action space; a dash for runs of"
-        " earlier versions. Score drops: score-bearing submits whose validation mean is below the one before."
+        " actions: share of the train steps whose action was outside the action space; a dash where they"
+        " were not counted. Score drops: score-bearing submits whose validation mean is below the one before."
         " Growth: AST nodes of the selected policy over those of the first. Wall time by phase, in seconds;"
         " phases may overlap.",
         columns=(

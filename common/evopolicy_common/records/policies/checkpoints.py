@@ -44,7 +44,7 @@ class CheckpointMeta(msgspec.Struct, frozen=True, kw_only=True):
     schema_version: str = PUBLISHED_SCHEMA
     submit_index: int
     submit_time: str
-    """Time of acceptance; empty when unknown from an older file."""
+    """Time of acceptance; empty: unknown."""
     n_episodes_requested: int
     remaining_budget_before: int
     remaining_budget_after: int

@@ -64,7 +64,7 @@ def test_packages_that_somebody_elses_run_names_are_refused_with_its_file(tmp_pa
     assert packages_for(policy, ["scipy"]) == ("scipy",)
 
 
-STAGED = Staged(agents_md_hash="h", initial_policy_hash="i")
+STAGED = Staged(agents_md_hash="h", rules_hash="r", initial_policy_hash="i")
 
 
 def test_a_completed_run_is_recorded_with_all_its_numbers(tmp_path: Path) -> None:

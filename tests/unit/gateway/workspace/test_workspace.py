@@ -50,8 +50,8 @@ def test_equal_rules_have_equal_hashes_whatever_the_urls(tmp_path: Path) -> None
     one = stage(folder_at(tmp_path / "a"), opened(), URLS)
     two = stage(folder_at(tmp_path / "b"), opened(), urls_below("http://127.0.0.1:1", "cd" * 16))
     other = stage(folder_at(tmp_path / "c"), opened(episode_budget=99), URLS)
-    assert one.agents_md_hash == two.agents_md_hash == digest_of(agents_md(opened(), NO_URLS).encode())
-    assert other.agents_md_hash != one.agents_md_hash
+    assert one.rules_hash == two.rules_hash == digest_of(agents_md(opened(), NO_URLS).encode())
+    assert other.rules_hash != one.rules_hash
 
 
 SPACES: list[tuple[dict[str, Any], Any]] = [
@@ -106,7 +106,7 @@ def test_an_operators_text_replaces_or_extends_the_rules(tmp_path: Path) -> None
     staged = stage(folder_at(tmp_path), opened(), URLS, text)
     written = (tmp_path / "run/workspace/AGENTS.md").read_text()
     assert written == f"Budget 12, $5.\n\n{agents_md(opened(), URLS)}\nSubmit to {URLS.submit}."
-    assert staged.agents_md_hash != stage(folder_at(tmp_path / "b"), opened(), URLS).agents_md_hash
+    assert staged.rules_hash != stage(folder_at(tmp_path / "b"), opened(), URLS).rules_hash
 
 
 @pytest.mark.parametrize(
