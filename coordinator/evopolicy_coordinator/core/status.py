@@ -11,7 +11,6 @@ from collections.abc import Callable
 from evopolicy_common.messages.status import QueuedJobs, RunStatus, StatusReply, WorkerStatus
 from evopolicy_coordinator.core.agents import permits
 from evopolicy_coordinator.core.contract.reasons import Reason
-from evopolicy_coordinator.core.contract.records import shared
 from evopolicy_coordinator.core.isolation import conflicts
 from evopolicy_coordinator.core.leasing import pins
 from evopolicy_coordinator.core.runs import finished
@@ -114,11 +113,15 @@ def _run(
 ) -> RunStatus:
     waiting = [waits[group] for group in groups if group in waits]
     progress, waits_at_end = finished.progress(state, run)
-    settings = run.row.settings
-    return shared(
-        RunStatus,
-        run.row,
-        settings,
+    row, settings = run.row, run.row.settings
+    return RunStatus(
+        run=row.run,
+        entry=settings.entry,
+        env=settings.env,
+        exp_id=settings.exp_id,
+        repeat=settings.repeat,
+        budget=row.budget,
+        created_at=row.created_at,
         phase=progress.phase,
         remaining_budget=run.ledger.available,
         n_submits=len(run.submits),

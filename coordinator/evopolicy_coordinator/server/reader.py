@@ -330,7 +330,18 @@ def _after(rows: Sequence[OutcomeRow | JournalRow], cursor: int) -> int:
 
 def feedback(outcome: EpisodeOutcome) -> EpisodeFeedback:
     """The part of a train episode's outcome that an agent may see."""
-    return records.shared(EpisodeFeedback, outcome, trajectory=outcome.trajectory or _NO_BYTES)
+    return EpisodeFeedback(
+        index=outcome.index,
+        episode_return=outcome.episode_return,
+        length=outcome.length,
+        failure=outcome.failure,
+        reward_components=outcome.reward_components,
+        trajectory=outcome.trajectory or _NO_BYTES,
+        video=outcome.video,
+        stdout=outcome.stdout,
+        stderr=outcome.stderr,
+        success=outcome.success,
+    )
 
 
 def damaged(error: DamagedStoreError) -> RefusedError:

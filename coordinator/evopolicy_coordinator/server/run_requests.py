@@ -46,7 +46,7 @@ from evopolicy_coordinator.core.contract.events import (
     RunCreated,
 )
 from evopolicy_coordinator.core.contract.reasons import because
-from evopolicy_coordinator.core.contract.records import EvaluationRow, RunRow, shared
+from evopolicy_coordinator.core.contract.records import EvaluationRow, RunRow
 from evopolicy_coordinator.core.runs.templates import RANDOM
 from evopolicy_coordinator.pki.identity import of_run
 from evopolicy_coordinator.server.reader import ServiceReader
@@ -203,10 +203,17 @@ class RunRequests:
         if wrong is not None or not ids:
             text = f"case {wrong} of {m.env}: the cases are 0 to {len(cases) - 1}"
             raise RefusedError(Refusal.INVALID_ENV_INSTANCE, text if ids else "no cases were given")
-        return shared(
-            EvaluationRow,
-            m,
+        return EvaluationRow(
             evaluation=f"e-{secrets.token_hex(8)}",
+            key=m.key,
+            env=m.env,
+            bundle=m.bundle,
+            split=m.split,
+            record=m.record,
+            limits=m.limits,
+            replays=m.replays,
+            as_in=m.as_in,
+            definition=m.definition,
             case_ids=ids,
             cases=tuple(cases[case_id] for case_id in ids),
             secret=secrets.token_bytes(32) if of is None else of.secret,

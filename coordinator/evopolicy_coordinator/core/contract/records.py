@@ -9,8 +9,7 @@ Rules that this module owns:
 
 from __future__ import annotations
 
-from functools import cache
-from typing import Any, Literal, TypeVar
+from typing import Any, Literal
 
 import msgspec
 
@@ -24,13 +23,12 @@ from evopolicy_common.messages.episode import (
     ResourceLimits,
     Tier,
 )
-from evopolicy_common.messages.gateway import SubmitDone, SubmitStatus
+from evopolicy_common.messages.gateway import SubmitAccepted, SubmitDone, SubmitStatus
 from evopolicy_common.messages.operator import Committed, PlayedAs, RunFinished
 from evopolicy_common.messages.run_settings import HiddenIsolation
 from evopolicy_common.messages.worker import Fingerprint
 from evopolicy_common.records.journal import Opening
 
-S = TypeVar("S", bound=msgspec.Struct)
 Phase = Literal["open", "closed", "finished"]
 
 
@@ -266,10 +264,14 @@ class OutcomeHead(msgspec.Struct, frozen=True, kw_only=True):
 def head_of(row: OutcomeRow) -> OutcomeHead:
     """The part of `row` that a snapshot holds."""
     outcome = row.outcome
-    return shared(
-        OutcomeHead,
-        row,
-        outcome,
+    return OutcomeHead(
+        group=row.group,
+        index=row.index,
+        seq=row.seq,
+        episode_return=outcome.episode_return,
+        length=outcome.length,
+        worker=row.worker,
+        success=outcome.success,
         failure=None if outcome.failure is None else outcome.failure.category,
         trajectory=None if outcome.trajectory is None else outcome.trajectory.digest,
     )
@@ -310,17 +312,13 @@ def latest_time(snapshot: Snapshot) -> float:
     return max(times, default=0.0)
 
 
-def shared(kind: type[S], *sources: msgspec.Struct, **others: Any) -> S:
-    """Returns a struct of that kind: each field is from `others`, or from the first source that has it."""
-    fields = {
-        name: getattr(source, name) for source in reversed(sources) for name in _common(kind, type(source))
-    }
-    return kind(**fields | others)
-
-
-@cache
-def _common(kind: type[msgspec.Struct], source: type[msgspec.Struct]) -> frozenset[str]:
-    return frozenset(kind.__struct_fields__) & frozenset(source.__struct_fields__)
+def submit_accepted(row: SubmitRow) -> SubmitAccepted:
+    """The acceptance of a submit, as its gateway receives it."""
+    return SubmitAccepted(
+        submit_index=row.submit_index,
+        first_global_episode=row.first_global_episode,
+        remaining_budget=row.remaining_budget,
+    )
 
 
 def submit_done(row: SubmitRow) -> SubmitDone | None:
@@ -328,12 +326,16 @@ def submit_done(row: SubmitRow) -> SubmitDone | None:
     if row.status is None or row.completed_at is None:
         return None
     n = len(row.env_instances)
-    return shared(
-        SubmitDone,
-        row,
+    return SubmitDone(
+        status=row.status,
         n_episodes=0 if row.refunded else n,
+        env_instances=row.env_instances,
+        first_global_episode=row.first_global_episode,
         remaining_budget=row.remaining_budget + (n if row.refunded else 0),
         started_at=row.accepted_at,
+        completed_at=row.completed_at,
+        failure=row.failure,
+        n_kept=row.n_kept,
     )
 
 

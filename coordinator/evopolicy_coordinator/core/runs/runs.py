@@ -17,7 +17,7 @@ from evopolicy_common.messages.status import RetriedJobs
 from evopolicy_coordinator.core.agents import requests
 from evopolicy_coordinator.core.contract import events
 from evopolicy_coordinator.core.contract.reasons import NotDoneError, Reason
-from evopolicy_coordinator.core.contract.records import RunRow, RunStateRow, shared, submit_group
+from evopolicy_coordinator.core.contract.records import RunRow, RunStateRow, submit_group
 from evopolicy_coordinator.core.leasing import pins
 from evopolicy_coordinator.core.runs import journal, waits
 from evopolicy_coordinator.core.structures.ledger import Ledger
@@ -105,16 +105,22 @@ def opened(state: State, event: events.Requested[gateway.OpenRun], step: Step) -
     if not event.message.asks_permit:
         requests.demand_permit(state, run, step)
     current, waits_for = run_state(state, run, step.now)
+    row, settings = run.row, run.row.settings
     step.reply(
         event.request,
-        shared(
-            gateway.RunOpened,
-            run.row,
-            run.row.settings,
+        gateway.RunOpened(
+            **{name: getattr(settings, name) for name in gateway.Conditions.__struct_fields__},
             env=description,
-            n_env_instances=len(run.row.train),
-            episode_budget=run.row.budget,
+            n_env_instances=len(row.train),
+            episode_budget=row.budget,
+            min_episodes_per_submit=row.min_episodes_per_submit,
+            max_episodes_per_submit=row.max_episodes_per_submit,
+            sandbox_tier=settings.sandbox_tier,
+            limits=settings.limits,
+            allowed_imports=row.allowed_imports,
+            denied_imports=row.denied_imports,
             state=current,
+            max_steps=row.max_steps,
         ),
         waits_for,
     )

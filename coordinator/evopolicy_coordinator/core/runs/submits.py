@@ -22,7 +22,7 @@ from evopolicy_coordinator.core.agents import requests
 from evopolicy_coordinator.core.contract import events
 from evopolicy_coordinator.core.contract.effects import ReadResults
 from evopolicy_coordinator.core.contract.reasons import NotDoneError
-from evopolicy_coordinator.core.contract.records import SubmitRow, shared, submit_group
+from evopolicy_coordinator.core.contract.records import SubmitRow, submit_accepted, submit_group
 from evopolicy_coordinator.core.leasing import groups
 from evopolicy_coordinator.core.runs import templates, waits
 from evopolicy_coordinator.core.runs.runs import held_s
@@ -65,7 +65,7 @@ def _again(event: events.Requested[gateway.Submit], row: SubmitRow, step: Step) 
     message = event.message
     if (message.env_instances, message.bundle) != (row.env_instances, row.bundle):
         raise NotDoneError("key_used", key=message.key, submit=row.submit_index)
-    step.reply(event.request, shared(gateway.SubmitAccepted, row))
+    step.reply(event.request, submit_accepted(row))
 
 
 def _accept(state: State, run: Run, event: events.Requested[gateway.Submit], step: Step) -> None:
@@ -87,7 +87,7 @@ def _accept(state: State, run: Run, event: events.Requested[gateway.Submit], ste
     )
     run.submits.append(row)
     run.keys[message.key] = index
-    step.reply(event.request, shared(gateway.SubmitAccepted, row))
+    step.reply(event.request, submit_accepted(row))
     step.log("info", "submit_accepted", run=run.id, submit=index, episodes=n, remaining=row.remaining_budget)
     failure = message.bundle_error
     if failure is not None:

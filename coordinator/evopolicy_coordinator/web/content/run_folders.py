@@ -29,7 +29,6 @@ from evopolicy_common.records.run_files import RUN_JSON, read_record
 from evopolicy_common.records.suite_folder import INDEX, PAUSED, Entry, Index
 from evopolicy_common.records.summary import Summary
 from evopolicy_common.regular_files import read_regular
-from evopolicy_coordinator.core.contract.records import shared
 from evopolicy_results.reading.environments import learn_names
 from evopolicy_results.reading.reader import find_run_dirs
 
@@ -284,13 +283,18 @@ def _finished(folder: Path) -> RunFacts:
     outcome, dimensions, tokens = record.outcome, record.experiment_dimensions, record.agent.tokens
     retries = outcome.auxiliary.get("infrastructure_retries")
     submits = Reader([]).submits(folder)
-    return shared(
-        RunFacts,
-        record,
-        dimensions,
+    return RunFacts(
         key=key_of(str(folder)),
         path=folder,
+        run=record.run,
         entry=record.agent.entry or record.model,
+        env=record.env,
+        exp_id=record.exp_id,
+        repeat=record.repeat,
+        attempt=record.attempt,
+        start=record.start,
+        replay_of=record.replay_of,
+        hidden_cases=dimensions.hidden_cases,
         state=outcome.status,
         budget=dimensions.episode_budget,
         used=outcome.budget_used,
