@@ -18,6 +18,7 @@ SEEDS, OFTEN = 1000, 200
 SEEDS_PER_BUG = 500
 
 
+@pytest.mark.timeout(900)
 @pytest.mark.parametrize(
     "first",
     [pytest.param(each, marks=[pytest.mark.system] * (each >= OFTEN)) for each in range(0, SEEDS, 100)],

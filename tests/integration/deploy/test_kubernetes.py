@@ -34,6 +34,7 @@ def validate() -> Path:
     return python_with("kubernetes", "kubernetes-validate==1.37.0").with_name("kubernetes-validate")
 
 
+@pytest.mark.timeout(600)
 @pytest.mark.parametrize("version", VERSIONS)
 def test_kubernetes_own_schemas_accept_the_manifests_and_nothing_else(
     validate: Path, version: str, tmp_path: Path
