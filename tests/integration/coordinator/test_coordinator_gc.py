@@ -16,7 +16,6 @@ from coordinator_harness import (
     Coordinator,
     GatewayClient,
     bundle_of,
-    comparable,
     gateway_of,
     operator_of,
     play,
@@ -79,9 +78,9 @@ def test_a_run_continues_from_a_backup_of_a_running_coordinator(
             await gateway.submit(bundle_of("two"), tuple(range(8)), "k1")
             await gateway.results(1)
             await gateway.close()
-            finished = comparable(await operator.finished(run_id))
-            assert finished["budget_used"] == 16
-            assert sorted(finished["val_scores"]) == [0, 1]
+            finished = await operator.finished(run_id)
+            assert finished.budget_used == 16
+            assert sorted(finished.val_scores) == [0, 1]
 
     before, ids = coordinator.credentials("gateway"), list[str]()
     run(begin)
