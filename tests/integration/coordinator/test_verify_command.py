@@ -155,7 +155,7 @@ def test_numbers_that_no_episode_shows_are_compared_with_the_coordinators(
     path.write_text(json.dumps(json.loads(path.read_text()) | {"returns": [-1.0]}))
     report = played.verify(run, "--sample", "1", code=1)
     found = [one["difference"] for one in report["differences"]]
-    assert any(text.startswith("final_score is -1.0; the coordinator has") for text in found), found
+    assert any(text.startswith("outcome.final_score is -1.0; the coordinator has") for text in found), found
     assert any(text.startswith("number of returns is 1") for text in found), found
 
 
