@@ -131,11 +131,10 @@ def _conformance(
 
 def in_a_slot(env_id: str, definitions: tuple[Entry, ...]) -> InASlot:
     """Plays the begin of one train episode in a slot of its own, with the neutral action at each step."""
-    return asyncio.run(_in_a_slot(env_id, definitions))
+    return asyncio.run(_in_a_slot(env_id, available_tiers(unsandboxed=True)[0], definitions))
 
 
-async def _in_a_slot(env_id: str, definitions: tuple[Entry, ...]) -> InASlot:
-    tier = available_tiers(unsandboxed=True)[0]
+async def _in_a_slot(env_id: str, tier: Tier, definitions: tuple[Entry, ...]) -> InASlot:
     with scratch_folder("check") as scratch:
         slot = Slot(None, tier, scratch / "slot", definitions=definitions)
         bundle = scratch / "bundle"
