@@ -349,8 +349,8 @@ def test_a_published_record_with_impossible_values_is_left_out(tmp_path: Path, v
 def test_the_untouched_run_is_read_by_all(whole: Path, tmp_path: Path) -> None:
     run = copy(whole, tmp_path)
     for name, reader in READERS.items():
-        if name == "publish":  # it has no place in a journal
-            with pytest.raises(ConfigError, match="no journal"):
+        if name == "publish":  # no coordinator committed to it
+            with pytest.raises(ConfigError, match="names no commitment"):
                 reader(run, whole)
         else:
             reader(run, whole)
