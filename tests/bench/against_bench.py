@@ -13,6 +13,7 @@ import os
 import statistics
 import subprocess
 import sys
+import tempfile
 from pathlib import Path
 
 import frame
@@ -67,14 +68,16 @@ def measured(clone: Path, env: str, n: int) -> list[float]:
     local = clone / ".venv" / "bin" / "python"
     python = str(local) if clone != ROOT else sys.executable
     path = os.pathsep.join(str(clone / "tests" / name) for name in ("bench", "support"))
-    done = subprocess.run(
-        [python, "-c", MEASURE, env, str(n)],
-        cwd=clone,
-        env=os.environ | {"PYTHONPATH": path},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    # A state folder of another revision cannot be read, and must not be changed.
+    with tempfile.TemporaryDirectory(prefix="evopolicy-against-") as state:
+        done = subprocess.run(
+            [python, "-c", MEASURE, env, str(n)],
+            cwd=clone,
+            env=os.environ | {"PYTHONPATH": path, "XDG_STATE_HOME": state},
+            capture_output=True,
+            text=True,
+            check=False,
+        )
     if done.returncode:
         raise SystemExit(f"error: {env} in {clone}: {done.stderr.strip()[-1000:]}")
     return list(json.loads(done.stdout.splitlines()[-1]))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -130,3 +131,7 @@ def write_suite(
                 )
                 out.append(folder)
     return out
+
+
+if __name__ == "__main__":  # RUNS ENV...: the runs in the documentation's pictures
+    write_suite(Path(sys.argv[1]), environments=sys.argv[2:], repeats=5)
