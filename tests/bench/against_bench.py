@@ -28,13 +28,15 @@ ENVIRONMENTS = {
     "gym/reacher5": 32,
     "gym/halfcheetah5": 8,
     "gymnasium/MiniGrid-FourRooms-v0": 32,
+    "gymnasium/parking-v0": 4,
 }
 """Episodes of a submit by id."""
 MEASURE = """
 import json, sys
 import runtime_bench
 env, n = sys.argv[1], int(sys.argv[2])
-print(json.dumps(runtime_bench.agent_measured(env, n, runtime_bench.SMALL * n, how="--small")["small_s"]))
+hidden = "--validation", "1", "--heldout", "1"
+print(json.dumps(runtime_bench.agent_measured(env, n, runtime_bench.SMALL * n, *hidden, how="--small")["small_s"]))
 """
 
 

@@ -186,9 +186,11 @@ class Player:
             episode = _Episode(job, k, job.episodes[k], environment, self.policies, progress, tell, begun)
             try:
                 outcome, log, unused = episode.play()
-                # In every split, as a policy of several episodes can measure the pause between them.
-                packed = begun.packed() if job.bundle is not None and len(job.episodes) > 1 else None
-                kept = packed if is_kept(job) else None
+                kept = None
+                if len(job.episodes) > 1 and (is_kept(job) or (job.bundle and job.policy_scope == "submit")):
+                    # In every split, as a policy of several episodes can measure the pause between them.
+                    packed = begun.packed()
+                    kept = packed if is_kept(job) else None
                 finished = messages.Finished(outcome=_brief(outcome, _share(job)), begun=kept, unused=unused)
                 return outcome, messages.framed(finished), log
             except EndedFromOutsideError as error:
