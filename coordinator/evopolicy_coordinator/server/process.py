@@ -20,7 +20,6 @@ from evopolicy_common import catalogue
 from evopolicy_common.errors import ConfigError, DamagedStoreError, LeadLostError, StorageError
 from evopolicy_common.logs import structlog
 from evopolicy_common.processes.packages import SIMULATORS
-from evopolicy_common.records.blobs import BlobStore
 from evopolicy_common.wire import credentials, transport
 from evopolicy_common.wire.credentials import Ready
 from evopolicy_coordinator.core.contract.settings import CoreSettings
@@ -34,7 +33,16 @@ from evopolicy_coordinator.server.run_requests import RunRequests
 from evopolicy_coordinator.server.service import Service
 from evopolicy_coordinator.server.uploads import Uploads
 from evopolicy_coordinator.splits import SplitSource, load_or_create_secret, secret_of
-from evopolicy_coordinator.storage.engines import Place, checked_address, chosen_place, record_place
+from evopolicy_coordinator.storage.engines import (
+    BLOBS,
+    ROWS,
+    Place,
+    checked_address,
+    chosen_place,
+    place_of,
+    record_place,
+)
+from evopolicy_coordinator.storage.objects import ObjectBlobs, blobs_of, checked_blobs
 from evopolicy_coordinator.storage.sealing import APPROVED, SharedFiles
 from evopolicy_coordinator.storage.state_folder import (
     ROLES,
@@ -62,6 +70,8 @@ class Options(msgspec.Struct, frozen=True, kw_only=True):
     """Address of a PostgreSQL database; None: as the state folder says, else SQLite."""
     seal_key: Path | None = None
     """File with the key that seals the secrets in the database; None: they are not shared."""
+    blobs: str | None = None
+    """Address of an object store, or a folder; None: as the state folder says, else its own."""
     listen: tuple[str, ...] = ()
     """Endpoints besides the unix socket in the state folder; port 0 picks a free port."""
     insecure_tcp: bool = False
@@ -88,7 +98,7 @@ async def run(options: Options, stop: asyncio.Event, on_ready: Callable[[Ready],
     """
     if options.store is not None:
         checked_address(options.store)  # before anything is created
-    place, why = chosen_place(options.state.absolute(), options.store), ""
+    place, why = chosen_place(options.state.absolute(), ROWS, options.store), ""
     shared = SharedFiles(options.state.absolute(), options.seal_key)
     if isinstance(place, str):
         with held(options.state.absolute()):  # before the folder gets an identity of its own
@@ -103,9 +113,11 @@ async def run(options: Options, stop: asyncio.Event, on_ready: Callable[[Ready],
     with contextlib.closing(opened) as state:
         machines = Machines(state.root)
         listen = _listen(state, options, machines)
+        blobs = None if options.blobs is None else checked_blobs(options.blobs)
+        where = chosen_place(state.root, BLOBS, blobs)
         while not stop.is_set():
             try:
-                await _lead(options, state, place, shared, machines, listen, stop, on_ready)
+                await _lead(options, state, (place, where), shared, machines, listen, stop, on_ready)
                 break
             except DamagedStoreError:
                 raise
@@ -147,15 +159,16 @@ async def _pause(stop: asyncio.Event) -> None:
 async def _lead(
     options: Options,
     state: StateFolder,
-    place: Place,
+    places: tuple[Place, Place],
     shared: SharedFiles,
     machines: Machines,
     listening: tuple[tuple[str, ...], tuple[str, ...]],
     stop: asyncio.Event,
     on_ready: Callable[[Ready], None],
 ) -> None:
-    """Serves while this coordinator leads, until `stop`. Raises LeadLostError when another one leads."""
-    listen, remote = listening
+    """Serves while this coordinator leads, until `stop`. `places`: of rows and blobs. Raises LeadLostError when another
+    one leads."""
+    (place, where), (listen, remote) = places, listening
     async with contextlib.AsyncExitStack() as opened:
         if isinstance(place, str):
             await asyncio.to_thread(shared.join, place)  # while another one leads
@@ -172,14 +185,17 @@ async def _lead(
         load_or_create_secret(
             state.root / SIGNING_KEY
         )  # now, so that every backup has it: runs are named from it
-        record_place(state.root, place)
+        record_place(state.root, ROWS, place)
         # Otherwise agents would wait for `silent_bar_s`, as a worker of an earlier command might still play.
         ended = [] if options.local is None else await asyncio.to_thread(state.ended_workers)
         if ended:
             store.forget_kernels(ended)
         for name in ended:
             (state.root / credentials.WORKERS / name).unlink()
-        blobs = BlobStore(state.root / "blobs")
+        blobs = blobs_of(state.root, place, where, lambda: store.incarnation)
+        if isinstance(blobs, ObjectBlobs) and where != place_of(state.root, BLOBS):
+            await asyncio.to_thread(blobs.claim, state.identity.operator_token)
+        record_place(state.root, BLOBS, where)
         blobs.drop_unfinished()
         uploads = Uploads()
         reader = ServiceReader(place, blobs, uploads, state.root)

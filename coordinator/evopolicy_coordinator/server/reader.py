@@ -17,7 +17,13 @@ from pathlib import Path
 from typing import Any
 from zlib import crc32
 
-from evopolicy_common.errors import DamagedStoreError, ProtocolError, RefusedError, StorageError
+from evopolicy_common.errors import (
+    DamagedStoreError,
+    LeadLostError,
+    ProtocolError,
+    RefusedError,
+    StorageError,
+)
 from evopolicy_common.logs import structlog
 from evopolicy_common.messages.episode import BlobRef, EpisodeOutcome
 from evopolicy_common.messages.gateway import EpisodeFeedback, ResultsPage
@@ -77,7 +83,7 @@ class ServiceReader:
         self.storage_error = ""
         """Why the last chunk of a blob could not be written; empty: it was."""
         self._database = database
-        self._blobs = blobs
+        self.blobs = blobs
         self._uploads = uploads
         self._local = threading.local()
         self._pages = ThreadPoolExecutor(_READERS, thread_name_prefix="pages")
@@ -109,7 +115,7 @@ class ServiceReader:
     def drop_uploads(self, over: Callable[[str], bool]) -> None:
         """Deletes the uploads of runs that are over, except those that a stored submit names or others have stored."""
         for run, stored in self._uploads.forget(over).items():
-            self._lanes[0].submit(self._blobs.drop_unfinished, f"gw/{run}")
+            self._lanes[0].submit(self.blobs.drop_unfinished, f"gw/{run}")
             for digest, state in stored.items():
                 self._lane(digest).submit(self._drop, run, digest, state)
 
@@ -191,7 +197,7 @@ class ServiceReader:
     def _drop(self, run: str, digest: str, stored: FileState) -> None:
         try:
             if digest not in self._reader.bundles(run):
-                self._blobs.delete(digest, stored)
+                self.blobs.delete(digest, stored)
         except StorageError as error:
             log.error("an upload stays until `evopolicy-coordinator gc`", run=run, error=str(error))
 
@@ -294,11 +300,11 @@ class ServiceReader:
         if run is not None and not self._uploads.has_sent(run, message.digest):
             on_whole = partial(self._uploads.note, run, message.digest)
         try:
-            have = self._blobs.append_chunk(
+            have = self.blobs.append_chunk(
                 sender, message.digest, message.size, message.offset, message.data, on_whole
             )
         except StorageError as error:
-            if error.__cause__ is not None:  # the disk's fault, not the sender's
+            if error.__cause__ is not None or isinstance(error, LeadLostError):  # our own fault
                 self.storage_error = str(error)
                 raise
             raise RefusedError(Refusal.BAD_BLOB, str(error)) from error
@@ -308,9 +314,9 @@ class ServiceReader:
     def _get(self, run: str | None, message: BlobGet) -> Message:
         known = is_digest(message.digest) and (run is None or self._reader.names_blob(run, message.digest))
         text = f"no blob {message.digest[:80]!r} here"
-        require(known and self._blobs.has(message.digest), Refusal.UNKNOWN_BLOB, text)
-        data = self._blobs.read_chunk(message.digest, max(0, message.offset), codec.CHUNK_BYTES)
-        return BlobChunk(size=self._blobs.size(message.digest), data=data)
+        require(known and self.blobs.has(message.digest), Refusal.UNKNOWN_BLOB, text)
+        data = self.blobs.read_chunk(message.digest, max(0, message.offset), codec.CHUNK_BYTES)
+        return BlobChunk(size=self.blobs.size(message.digest), data=data)
 
 
 _READS: dict[type, Callable[[ServiceReader, Any], Message]] = {

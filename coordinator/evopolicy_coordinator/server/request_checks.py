@@ -82,8 +82,9 @@ def bounded_close(message: gateway.CloseRun) -> gateway.CloseRun:
 def check_stored(blobs: BlobStore, ref: BlobRef) -> None:
     """Checks that the blob is stored, with the announced size."""
     text = f"blob {ref.digest[:64]!r} is not stored here; upload it first"
-    require(is_digest(ref.digest) and blobs.has(ref.digest), Refusal.MISSING_BLOB, text)
-    size = blobs.size(ref.digest)
+    size = blobs.hold(ref.digest) if is_digest(ref.digest) else None
+    if size is None:
+        raise RefusedError(Refusal.MISSING_BLOB, text)
     text = f"blob {ref.digest} has {size:,} bytes, and not {ref.size:,} as announced"
     require(size == ref.size, Refusal.BAD_BLOB, text)
 
@@ -92,7 +93,8 @@ def check_bundle(blobs: BlobStore, digest: str | None, *, sent: bool = True) -> 
     """Checks that the bundle is stored, and that the sender uploaded it (`sent`)."""
     if digest is not None:
         text = f"bundle {digest[:64]!r} is not stored here; upload it first"
-        require(sent and is_digest(digest) and blobs.has(digest), Refusal.MISSING_BUNDLE, text)
+        stored = sent and is_digest(digest) and blobs.hold(digest) is not None
+        require(stored, Refusal.MISSING_BUNDLE, text)
 
 
 def check_token(expected: str, given: str) -> None:

@@ -128,11 +128,12 @@ class RequestParser:
         except ProtocolError:
             return False
 
-    @staticmethod
-    def reads_files(message: Message) -> bool:
+    def reads_files(self, message: Message) -> bool:
         """Whether `event` reads splits, blobs or the store for the message."""
         if isinstance(message, worker.ReportResults):
-            return any(result.packed is not None for result in message.results)
+            return self._blobs.remote or any(result.packed is not None for result in message.results)
+        if isinstance(message, gateway.Submit):
+            return self._blobs.remote
         return _opens(message)
 
     def event(self, parsed: Parsed, request: int, stimulus_id: str) -> AnyEvent:

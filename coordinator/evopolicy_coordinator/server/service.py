@@ -287,6 +287,9 @@ class Service:
             self._refuse(query, error)
         except DamagedStoreError as error:
             self._refuse(query, damaged(error))
+        except StorageError as error:
+            log.error("request failed; its sender asks again", key=query.key, error=str(error))
+            query.drop()
         except Exception:
             # A bug here must not stop the service. The client is notified immediately and may retry.
             log.exception("request failed", key=query.key)
@@ -428,10 +431,10 @@ class Service:
 
     @property
     def _trouble(self) -> str:
-        why = self.host.storage_error or self._reader.storage_error
+        why = self.host.storage_error or self._reader.storage_error or self._reader.blobs.trouble
         if not why:
             return ""
-        remedy = f"see that {self._reader.state} can be written"
+        remedy = f"see that {'it answers and has room' if '://' in why else f'{self._reader.state} can be written'}"
         if any(text in why for text in _FULL):
             remedy = f"make room in {self._reader.state}, {_ROOM_MB} MB or more (df -h, evopolicy gc)"
         return f"{_CANNOT_WRITE}: {why}; {remedy}. Runs continue by themselves then"

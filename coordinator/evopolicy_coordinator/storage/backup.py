@@ -23,6 +23,7 @@ from evopolicy_common.errors import ConfigError, StorageError
 from evopolicy_common.records.blobs import BlobStore, fsync_directory, write_atomically
 from evopolicy_coordinator.storage.engines import DATABASE, Place, connect, place_of
 from evopolicy_coordinator.storage.moving import copy_rows
+from evopolicy_coordinator.storage.objects import blobs_of
 from evopolicy_coordinator.storage.sealing import SHARED_FILES
 from evopolicy_coordinator.storage.store import Store
 
@@ -72,7 +73,7 @@ def _copy(state: Path, place: Place, folder: Path) -> tuple[int, int]:
             write_atomically(folder / name, data, mode=0o600)
     database = folder / DATABASE
     _copy_database(place, database)
-    source, blobs = BlobStore(state / "blobs"), BlobStore(folder / "blobs")
+    source, blobs = blobs_of(state, place), BlobStore(folder / "blobs")
     count, total = 0, database.stat().st_size
     for digest in source.digests():
         data = source.read(digest)

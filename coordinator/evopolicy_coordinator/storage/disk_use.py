@@ -3,8 +3,8 @@
 Rules:
 - An operator finds everything about a finished run in its run directory. The coordinator keeps the run's outcome for
   good, and its episodes and bundles until they are collected.
-- A blob is deleted when no row names it and it is older than `UNNAMED_S`, since it may have been uploaded for a row
-  that is about to be written. Uploading it again resets its age.
+- A blob is deleted when no row names it and it was last stored or held more than `UNNAMED_S` before: it may have been
+  uploaded for a row that is about to be written. Which blobs are that old is read first, and which are named after it.
 - Collection is safe beside a running coordinator; only shrinking the database file waits until none runs.
 """
 
@@ -21,7 +21,6 @@ import msgspec
 
 from evopolicy_common.errors import ConfigError, StorageError
 from evopolicy_common.messages.status import DiskUse
-from evopolicy_common.records.blobs import BlobStore
 from evopolicy_coordinator.core.contract.records import (
     BegunRow,
     EvaluationRow,
@@ -32,8 +31,9 @@ from evopolicy_coordinator.core.contract.records import (
     evaluation_group,
 )
 from evopolicy_coordinator.storage.engines import DATABASE, Database, connect, place_of
+from evopolicy_coordinator.storage.objects import ObjectBlobs, blobs_of
 from evopolicy_coordinator.storage.state_folder import lock
-from evopolicy_coordinator.storage.store import rows, stored_blobs
+from evopolicy_coordinator.storage.store import named_blobs, rows
 
 Bounds = tuple[str, str]
 """Group ids from the first (inclusive) to the second (exclusive)."""
@@ -98,7 +98,8 @@ def collect(
     """
     now = time.time() if now is None else now
     with _database(state) as db:
-        blobs = BlobStore(state / "blobs")
+        blobs = blobs_of(state, place_of(state))
+        unheld = blobs.unheld(UNNAMED_S, now, dry_run=dry_run)  # before it is read which ones are named
         old_runs = [row.run for row in rows(db, FinishedRow) if row.result.finished_at < now - older_than_s]
         old = (
             row
@@ -110,20 +111,19 @@ def collect(
         gone = [*map(_of_run, old_runs), *((group, f"{group}\x01") for group in groups)]
         named = _named(db, frozenset(old_runs), frozenset(old_evaluations))
         sizes = [_size(db, bounds) for bounds in gone]
-        unnamed = [
-            digest
-            for digest in blobs.digests()
-            if digest not in named and _age_s(blobs, digest, now) > UNNAMED_S
-        ]
-        bytes_ = sum(size for _, size in sizes) + sum(map(blobs.size, unnamed))
+        unnamed = {digest: found for digest, found in unheld.items() if digest not in named}
+        stored = blobs.sizes() if unnamed else {}
+        bytes_ = sum(size for _, size in sizes) + sum(stored.get(digest, 0) for digest in unnamed)
         shrunk = False
         if not dry_run:
             for bounds in gone:
                 _delete(db, bounds)
             for run in old_runs:
                 db.execute("DELETE FROM train_blobs WHERE run = ?", (run,))
-            for digest in unnamed:
-                blobs.delete(digest)
+            for digest, found in unnamed.items():
+                blobs.delete(digest, found)
+            if isinstance(blobs, ObjectBlobs):
+                blobs.sweep()
             shrunk = _shrink(state, db)
     return Collected(
         runs=sum(n > 0 for n, _ in sizes[: len(old_runs)]),
@@ -159,7 +159,7 @@ def use(state: Path) -> list[EnvironmentUse]:
     """Disk use of the stored runs by environment, largest first; runs whose episodes were collected are left out."""
     by_env: dict[str, EnvironmentUse] = {}
     with _database(state) as db:
-        blobs = BlobStore(state / "blobs")
+        stored = blobs_of(state, place_of(state)).sizes()
         for run in tuple(rows(db, RunRow)):
             train = db.execute(
                 "SELECT COUNT(*) FROM outcomes WHERE grp >= ? AND grp < ? AND grp LIKE ?",
@@ -169,7 +169,7 @@ def use(state: Path) -> list[EnvironmentUse]:
                 continue
             _, size = _size(db, _of_run(run.run))
             digests = db.execute("SELECT digest FROM train_blobs WHERE run = ?", (run.run,)).fetchall()
-            size += sum(blobs.size(digest) for (digest,) in digests if blobs.has(digest))
+            size += sum(stored.get(digest, 0) for (digest,) in digests)
             one = by_env.setdefault(run.settings.env, EnvironmentUse(run.settings.env))
             one.runs += 1
             one.train_episodes += train
@@ -213,26 +213,24 @@ def _delete(db: Database, bounds: Bounds) -> None:
             db.execute(f"DELETE FROM {table} WHERE grp >= ? AND grp < ?", bounds)
 
 
-def _named(db: Database, old_runs: frozenset[str], old_evaluations: frozenset[str]) -> set[str | None]:
+def _named(db: Database, old_runs: frozenset[str], old_evaluations: frozenset[str]) -> set[str]:
     """Digests of all blobs that the remaining rows name."""
-    named = {row.bundle for row in rows(db, SubmitRow) if row.run not in old_runs}
+    named: set[str] = set()
+    for submit in rows(db, SubmitRow):
+        if submit.run not in old_runs:
+            named.update(named_blobs(submit))
     for evaluation in rows(db, EvaluationRow):
         if evaluation.evaluation not in old_evaluations:
-            named |= {ref.digest for ref in evaluation.replays} | {evaluation.bundle}
+            named.update(named_blobs(evaluation))
     train_blobs = db.stream("SELECT run, digest FROM train_blobs")
     named |= {digest for run, digest in train_blobs if run not in old_runs}
-    named |= {row.begun.digest for row in rows(db, BegunRow) if row.begun is not None}
+    for begun in rows(db, BegunRow):
+        named.update(named_blobs(begun))
     for row in rows(db, OutcomeRow, "WHERE grp NOT LIKE ?", (_TRAIN,)):
         head, _, tail = row.group.partition("/")
         if head not in old_runs and not (head == "evaluation" and tail in old_evaluations):
-            named |= {ref.digest for ref in stored_blobs(row.outcome)}
+            named.update(named_blobs(row))
     return named
-
-
-def _age_s(blobs: BlobStore, digest: str, now: float) -> float:
-    with contextlib.suppress(OSError):
-        return now - blobs.path(digest).stat().st_mtime
-    return 0.0
 
 
 def _shrink(state: Path, db: Database) -> bool:

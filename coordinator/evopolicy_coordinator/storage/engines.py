@@ -20,7 +20,7 @@ import socket
 import sqlite3
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 from evopolicy_common.errors import ConfigError, DamagedStoreError, LeadLostError, StorageError
 from evopolicy_common.installation import add_extra
@@ -31,14 +31,28 @@ if TYPE_CHECKING:
     import psycopg
 
 Place = Path | str
-"""A SQLite file, or the address of a PostgreSQL database."""
+"""A SQLite file or a folder of blobs, or the address of a PostgreSQL database or an object store."""
 
 Mode = Literal["ro", "rw", "rwc"]
 
 DATABASE = "coordinator.sqlite"
 """Name of the SQLite file in a state folder."""
-ADDRESS = "store"
-"""Name of the file in a state folder that holds the address of its PostgreSQL database."""
+
+
+class Part(NamedTuple):
+    """A part of the state: the file or folder that has it in the state folder, the file there that says where it is
+    instead, and the options of `evopolicy-coordinator` and its `move` that name the place."""
+
+    content: str
+    own: str
+    note: str
+    option: str
+    move: str
+
+
+ROWS = Part("rows", DATABASE, "store", "--store", "--to")
+BLOBS = Part("blobs", "blobs", "blob-store", "--blobs", "--blobs")
+
 LOCK_WAIT_S = 4.0
 """Longest wait for the database's lock in one attempt."""
 
@@ -89,6 +103,10 @@ class Database(abc.ABC):
     """Begins a transaction whose reads are of one instant."""
     shared = ""
     """Ends a SELECT whose rows must not change before the transaction ends."""
+    exclusive = ""
+    """Ends a SELECT whose rows no other transaction may keep from changing meanwhile."""
+    clock: str
+    """The database's Unix time, whole seconds."""
 
     @contextlib.contextmanager
     def errors(self) -> Iterator[None]:
@@ -182,6 +200,7 @@ class Sqlite(Database):
         for when in ("UPDATE", "DELETE")
     )
     begin = "BEGIN IMMEDIATE"
+    clock = "CAST(strftime('%s', 'now') AS INTEGER)"
 
     def __init__(self, path: Path, mode: Mode, timeout_s: float) -> None:
         self.place = path
@@ -256,6 +275,8 @@ class Postgres(Database):
     )
     begin_reading = "BEGIN ISOLATION LEVEL REPEATABLE READ"
     shared = " FOR SHARE"
+    exclusive = " FOR UPDATE"
+    clock = "CAST(EXTRACT(EPOCH FROM clock_timestamp()) AS BIGINT)"
 
     def __init__(self, address: str, *, writes: bool) -> None:
         """Raises ConfigError for an address that cannot be used, LeadLostError when another coordinator keeps the lock,
@@ -351,36 +372,35 @@ def checked_address(address: str) -> str:
     return address
 
 
-def place_of(root: Path) -> Place:
-    """Where a state folder's rows are. Raises ConfigError when the folder has none."""
+def place_of(root: Path, part: Part = ROWS) -> Place:
+    """Where this part of a state folder is. Raises ConfigError when the folder has no rows."""
     with contextlib.suppress(FileNotFoundError):
-        return (root / ADDRESS).read_text().strip()
-    if not (root / DATABASE).is_file():
+        noted = (root / part.note).read_text().strip()
+        return noted if "://" in noted else Path(noted)
+    if part is ROWS and not (root / DATABASE).is_file():
         raise no_state(root, DATABASE)
-    return root / DATABASE
+    return root / part.own
 
 
-def chosen_place(root: Path, address: str | None) -> Place:
-    """Where the rows of a state folder are, or for a new one shall be. `address`: checked, as the operator names it;
-    None: as the folder says, else SQLite. Raises ConfigError when they contradict each other."""
-    try:
-        known = place_of(root)
-    except ConfigError:
-        return address or root / DATABASE
-    if address is not None and address != known:
+def chosen_place(root: Path, part: Part, named: Place | None) -> Place:
+    """Where this part of a state folder is, or for a new one shall be. `named`: by the operator, checked; None: as the
+    folder says, else its own. Raises ConfigError when they contradict each other."""
+    own = root / part.own
+    known = place_of(root, part) if own.exists() or (root / part.note).exists() else None
+    if None not in (known, named) and known != named:
         raise ConfigError(
-            f"--store {address}: the rows of {root} are in {known}; move them there first with"
-            f" evopolicy-coordinator move --to {address} --state {root}"
+            f"{part.option} {named}: the {part.content} of {root} are in {known}; move them there first with"
+            f" evopolicy-coordinator move {part.move} {named} --state {root}"
         )
-    return known
+    return known or named or own
 
 
-def record_place(root: Path, place: Place) -> None:
-    """Durably notes in the state folder where its rows are."""
-    if isinstance(place, str):
-        write_atomically(root / ADDRESS, f"{place}\n".encode(), mode=0o600)
+def record_place(root: Path, part: Part, place: Place) -> None:
+    """Durably notes in the state folder where this part is."""
+    if place == root / part.own:
+        (root / part.note).unlink(missing_ok=True)
     else:
-        (root / ADDRESS).unlink(missing_ok=True)
+        write_atomically(root / part.note, f"{place}\n".encode(), mode=0o600)
 
 
 def _psycopg() -> Any:

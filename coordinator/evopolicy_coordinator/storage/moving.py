@@ -1,10 +1,12 @@
-"""Moves the rows of a stopped coordinator from one engine to the other.
+"""Moves the rows of a stopped coordinator from one engine to the other, and its blobs to another place.
 
 Rules:
 - The rows are copied in one transaction and read back before it is committed: every table has as many rows with the
   same bytes, and the journal's heads follow from its entries. Until then the state folder names the old place.
 - The target has no rows of its own. The source keeps its rows; a SQLite file is renamed, so that no coordinator
   starts on it by mistake.
+- Each blob is checked where it is read, and read back from its new place before the state folder names that. The old
+  place keeps its blobs.
 """
 
 from __future__ import annotations
@@ -22,14 +24,17 @@ from evopolicy_common.records import journal
 from evopolicy_common.records.blobs import fsync_directory
 from evopolicy_coordinator.core.contract.records import JournalRow
 from evopolicy_coordinator.storage.engines import (
+    BLOBS,
     DATABASE,
+    ROWS,
     Database,
     checked_address,
     connect,
     place_of,
     record_place,
 )
-from evopolicy_coordinator.storage.state_folder import held
+from evopolicy_coordinator.storage.objects import ObjectBlobs, blobs_of, checked_blobs
+from evopolicy_coordinator.storage.state_folder import held, identity_of
 from evopolicy_coordinator.storage.store import SCHEMA, TABLES, Store, rows
 
 _CHUNK_BYTES = 4 << 20
@@ -76,12 +81,37 @@ def move(root: Path, to: str) -> Moved:
         if isinstance(target, Path):
             os.replace(partial, target)
             fsync_directory(root)
-            record_place(root, target)
+            record_place(root, ROWS, target)
         else:
-            record_place(root, target)
+            record_place(root, ROWS, target)
             os.replace(root / DATABASE, root / MOVED)
         fsync_directory(root)
     return Moved(source=str(source), target=str(target), rows=counts, head=head)
+
+
+def move_blobs(root: Path, to: str) -> int:
+    """Moves the blobs of the state folder `root` to an object store or a folder, and returns their number.
+
+    Raises ConfigError when a coordinator is running or `to` cannot be used, StorageError when a disk or object store
+    refuses or a blob is damaged; the folder then names the old place.
+    """
+    known, wanted = place_of(root, BLOBS), checked_blobs(to)
+    if known == wanted:
+        raise ConfigError(f"--blobs {to}: the blobs are there already")
+    if isinstance(known, str) and isinstance(wanted, str):
+        raise ConfigError(f"--blobs {to}: the blobs are in {known}; move them to a folder first")
+    place = place_of(root)
+    with held(root), contextlib.closing(connect(place, "rwc", _TIMEOUT_S)):
+        old, new = blobs_of(root, place, known), blobs_of(root, place, wanted)
+        if isinstance(new, ObjectBlobs):
+            new.claim(identity_of(root).operator_token)
+            new.forget_all()
+        moved = [new.put(old.read(digest)) for digest in tuple(old.digests())]
+        new.drop_unfinished()  # the copies too, so that the object store is read
+        for digest in moved:
+            new.read(digest)
+        record_place(root, BLOBS, wanted)
+    return len(moved)
 
 
 def copy_rows(source: Database, target: Database) -> tuple[dict[str, int], str]:

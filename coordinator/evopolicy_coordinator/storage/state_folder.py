@@ -11,6 +11,8 @@
       store                       the address of the PostgreSQL database that has it instead
       sealed                      what of this folder that database has too, for standbys: see sealing.py
       blobs/                      trajectories, videos and policy bundles
+      blob-store                  the address of the object store, or the folder, that has them instead
+      blob-copies/                unfinished uploads to an object store, and copies of blobs from there
       coordinator.sock            the socket for processes of this machine
       workers/<name>              locks of local commands' workers, which the kernel frees with the worker
 
@@ -125,7 +127,7 @@ class StateFolder:
         holder = Holder(process=os.getpid(), local=local)
         lock_fd = lock(root, holder)
         try:
-            return cls(root, lock_fd, holder, _identity(root))
+            return cls(root, lock_fd, holder, identity_of(root))
         except BaseException:
             os.close(lock_fd)
             raise
@@ -196,7 +198,7 @@ class StateFolder:
 def cluster_of(root: Path) -> str:
     """The name of a folder's cluster. Raises ConfigError as `StateFolder.open`."""
     _make_private(root)
-    return _identity(root).cluster
+    return identity_of(root).cluster
 
 
 @contextlib.contextmanager
@@ -250,7 +252,8 @@ def _write(fd: int, holder: Holder) -> None:
         os.pwrite(fd, msgspec.json.encode(holder) + b"\n", 0)
 
 
-def _identity(root: Path) -> Identity:
+def identity_of(root: Path) -> Identity:
+    """The identity of a state folder, made for a new one. Raises ConfigError for a damaged one."""
     path = root / "identity.json"
     try:
         return msgspec.json.decode(path.read_bytes(), type=Identity)

@@ -24,7 +24,7 @@ from typing import Any, NamedTuple, TypeVar, get_args
 
 import msgspec
 
-from evopolicy_common.errors import DECODE_ERRORS, ConfigError, DamagedStoreError, LeadLostError
+from evopolicy_common.errors import DECODE_ERRORS, ConfigError, DamagedStoreError, LeadLostError, StorageError
 from evopolicy_common.messages.episode import BlobRef, EpisodeOutcome
 from evopolicy_common.messages.operator import RunFinished
 from evopolicy_common.records.splits import SPLITS
@@ -37,8 +37,11 @@ BUSY_TIMEOUT_S = 10.0
 """How long to wait for another process's transaction: `evopolicy gc` runs beside a coordinator."""
 
 _PAGE_ROWS = 10_000
-SCHEMA = 6
+SCHEMA = 7
 """Version of the tables and of the rows in them."""
+NAMED, CONDEMNED = -1, -2
+"""Marks of blobs in an object store: a row names it; its object is deleted. 0: no row has named it yet. Positive: a
+collection's."""
 TABLES = {
     "meta": "name TEXT PRIMARY KEY, value INTEGER NOT NULL",
     "runs": "run TEXT PRIMARY KEY, key TEXT NOT NULL UNIQUE, data BLOB NOT NULL",
@@ -59,6 +62,8 @@ TABLES = {
     "kernels": "worker TEXT PRIMARY KEY, data BLOB NOT NULL",
     "journal": "seq INTEGER PRIMARY KEY, reveals TEXT NOT NULL, data BLOB NOT NULL",
     "documents": "run TEXT NOT NULL, kind TEXT NOT NULL, data BLOB NOT NULL, PRIMARY KEY (run, kind)",
+    "objects": "digest TEXT PRIMARY KEY, name TEXT NOT NULL, size INTEGER NOT NULL, since INTEGER NOT NULL,"
+    " mark INTEGER NOT NULL",
 }
 
 _encode = msgspec.msgpack.Encoder().encode
@@ -113,7 +118,8 @@ class Store:
         Raises ConfigError for another schema or the database of another state folder, LeadLostError while another
         coordinator leads, StorageError."""
         self._db = connect(place, "rwc", BUSY_TIMEOUT_S)
-        self._incarnation = 0
+        self.incarnation = 0
+        """Of the state that `load` has read last; 0 before."""
         try:
             with self._db.errors():
                 self._prepare(
@@ -145,16 +151,32 @@ class Store:
     def write(self, changed: Iterable[records.Row]) -> None:
         """Writes all rows in one durable transaction. Raises StorageError when it fails; the caller then loads the rows
         again."""
-        with self._transaction(), self._db.batch():
-            for row in changed:
-                _write_row(self._db, row)
+        changed = tuple(changed)
+        named = sorted({digest for row in changed for digest in named_blobs(row)})
+        with self._transaction():
+            self._name(named)
+            with self._db.batch():
+                for row in changed:
+                    _write_row(self._db, row)
+
+    def _name(self, digests: list[str]) -> None:
+        """Keeps these blobs from being collected from an object store. Raises StorageError when one has been."""
+        if not digests:
+            return
+        among = f"digest IN ({', '.join('?' * len(digests))})"
+        self._db.execute(f"UPDATE objects SET mark = {NAMED} WHERE mark > {CONDEMNED} AND {among}", digests)
+        query = f"SELECT digest FROM objects WHERE mark = {CONDEMNED} AND {among}"
+        if (gone := self._db.execute(query, digests).fetchone()) is not None:
+            raise StorageError(
+                f"blob {gone[0]} was collected before a row named it; it is to be uploaded again"
+            )
 
     @contextlib.contextmanager
     def _transaction(self) -> Iterator[None]:
         """A durable transaction. Raises LeadLostError when another coordinator has loaded the rows since `load`."""
         with self._db.errors(), self._db.transaction():
             query = f"SELECT value FROM meta WHERE name = 'incarnation'{self._db.shared}"
-            if self._incarnation and self._db.execute(query).fetchone() != (self._incarnation,):
+            if self.incarnation and self._db.execute(query).fetchone() != (self.incarnation,):
                 raise LeadLostError(f"{self._db.place}: another coordinator has taken over")
             yield
 
@@ -207,9 +229,11 @@ class Store:
         with self._db.errors():
             with self._db.transaction():
                 self._db.execute("UPDATE meta SET value = value + 1 WHERE name = 'incarnation'")
+                # Nothing that was decided before is written any more.
+                self._db.execute(f"DELETE FROM objects WHERE mark = {CONDEMNED}")
             with self._db.transaction(self._db.begin_reading):
                 snapshot = self._snapshot()
-        self._incarnation = snapshot.incarnation
+        self.incarnation = snapshot.incarnation
         return snapshot
 
     def _snapshot(self) -> records.Snapshot:
@@ -371,6 +395,20 @@ def train_run(group: str) -> str | None:
     """The run whose train episodes `group` holds; None for every other group."""
     head, _, kind = group.rpartition("/")
     return (head.rpartition("/")[0] or None) if kind == "train" else None
+
+
+def named_blobs(row: Any) -> Iterable[str]:
+    """Digests of the blobs that a row names without carrying their bytes."""
+    if isinstance(row, records.SubmitRow | records.EvaluationRow) and row.bundle is not None:
+        yield row.bundle
+    refs: Iterable[BlobRef] = ()
+    if isinstance(row, records.EvaluationRow):
+        refs = row.replays
+    elif isinstance(row, records.BegunRow):
+        refs = () if row.begun is None else (row.begun,)
+    elif isinstance(row, records.OutcomeRow):
+        refs = stored_blobs(row.outcome)
+    yield from (ref.digest for ref in refs if ref.inline is None)
 
 
 def stored_blobs(outcome: EpisodeOutcome) -> tuple[BlobRef, ...]:

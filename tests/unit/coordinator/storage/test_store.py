@@ -23,7 +23,7 @@ from evopolicy_coordinator.core.contract.records import (
     head_of,
 )
 from evopolicy_coordinator.storage import disk_use
-from evopolicy_coordinator.storage.engines import Place, Sqlite, checked_address, connect, record_place
+from evopolicy_coordinator.storage.engines import ROWS, Place, Sqlite, checked_address, connect, record_place
 from evopolicy_coordinator.storage.store import SCHEMA, Reader, Store, train_run
 
 TRAIN = records.submit_group("r-1", 0, "train")
@@ -305,7 +305,7 @@ def test_disk_use_of_what_is_no_state_folder_makes_nothing(tmp_path: Path) -> No
 
 
 def test_disk_use_names_the_row_that_it_cannot_read(store: Store, place: Place, path: Path) -> None:
-    record_place(path.parent, place)
+    record_place(path.parent, ROWS, place)
     store.write([run_row(), state_row(), submit_row()])
     store._db.execute("UPDATE submits SET data = ?", (b"\0",))
     with pytest.raises(DamagedStoreError, match=f"{re.escape(str(place))}: table submits, row"):
