@@ -98,6 +98,42 @@ async def ended(coordinator: Coordinator, created: RunCreated) -> dict[str, Any]
         return comparable(await operator.finished(created.run))
 
 
+def test_a_run_survives_the_failover_to_another_server(
+    tmp_path: Path, calm: tuple[Path, dict[str, Any]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Two servers with synchronous streaming replication. The first one is lost before a submit, and the other one
+    promoted while its gateway asks: nothing that was answered is missing there."""
+    secret, expected = calm
+    with contextlib.ExitStack() as stack:
+        first = Server()
+        stack.callback(first.close)
+        other = Server(follows=first)
+        stack.callback(other.close)
+        for each in (first, other):
+            each.passfile.write_text(f"*:*:*:evopolicy:{first.password}\n")
+        monkeypatch.setenv("PGPASSFILE", str(first.passfile))
+        database = first.new().rpartition("/")[2]
+        hosts = f"127.0.0.1:{first.port},127.0.0.1:{other.port}"
+        address = f"postgresql://evopolicy@{hosts}/{database}?target_session_attrs=read-write"
+        coordinator = stack.enter_context(serving(tmp_path / "state", secret, "--store", address))
+
+        async def play() -> None:
+            async with operator_of(coordinator) as operator, working(coordinator, pause_s=0.05):
+                created = await operator.create()
+                await submit(coordinator, created, 0)
+                await asyncio.to_thread(first.kill)
+                playing = asyncio.create_task(patiently(coordinator, created, 1))
+                while "the store cannot write" not in coordinator.log.read_text():
+                    await asyncio.sleep(0.05)
+                await asyncio.to_thread(other.query, "postgres", "SELECT pg_promote()")
+                await playing
+                await submit(coordinator, created, 2)
+                assert await ended(coordinator, created) == expected
+
+        run(play, 150)
+        assert "the store writes again" in coordinator.log.read_text()
+
+
 def test_a_run_survives_kills_of_server_and_coordinator(
     tmp_path: Path, server: Server, calm: tuple[Path, dict[str, Any]]
 ) -> None:

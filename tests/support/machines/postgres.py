@@ -32,7 +32,9 @@ def programs() -> Path | None:
 class Server:
     """A started server. Its password is in the file that `PGPASSFILE` names."""
 
-    def __init__(self) -> None:
+    def __init__(self, *, durable: bool = False, follows: Server | None = None) -> None:
+        """`durable`: it waits for the disk. `follows`: it has that one's rows by streaming replication, and each commit
+        there waits until they can be read here."""
         bin_ = programs()
         if bin_ is None:
             pytest.skip("needs a PostgreSQL server: make test-cluster as root, or apt-get install postgresql")
@@ -46,36 +48,49 @@ class Server:
         with socket.socket() as probe:
             probe.bind(("127.0.0.1", 0))
             self.port = probe.getsockname()[1]
-        self.password = secrets.token_hex(8)
+        self._durable = durable
+        self.password = secrets.token_hex(8) if follows is None else follows.password
         password = self.root / "password"
         password.write_text(self.password)
         password.chmod(0o644)
-        self._run(
-            "initdb",
-            "-D",
-            str(self.root / "data"),
-            "-U",
-            "evopolicy",
-            "-A",
-            "scram-sha-256",
-            f"--pwfile={password}",
-            "--no-sync",
-            "-E",
-            "UTF8",
-            "--locale=C.UTF-8",
-        )
+        data = ("-D", str(self.root / "data"), "--no-sync")
+        if follows is None:
+            how = (
+                "-U",
+                "evopolicy",
+                "-A",
+                "scram-sha-256",
+                f"--pwfile={password}",
+                "-E",
+                "UTF8",
+                "--locale=C.UTF-8",
+            )
+            self._run("initdb", *data, *how)
+        else:
+            link = f"host=127.0.0.1 port={follows.port} user=evopolicy password={self.password}"
+            self._run("pg_basebackup", *data, "--checkpoint=fast", "--write-recovery-conf", "-d", link)
         self.passfile = self.root.with_name(f"{self.root.name}.pass")
         self.passfile.write_text(f"127.0.0.1:{self.port}:*:evopolicy:{self.password}\n")
         self.passfile.chmod(0o600)
         self._n = 0
         self.start()
+        if follows is not None:
+            for setting in ("synchronous_standby_names = '*'", "synchronous_commit = remote_apply"):
+                follows.query("postgres", f"ALTER SYSTEM SET {setting}")
+            follows.query("postgres", "SELECT pg_reload_conf()")
+            synchronous = "SELECT 1 FROM pg_stat_replication WHERE sync_state = 'sync'"
+            deadline = time.monotonic() + _TIMEOUT_S
+            while not follows.query("postgres", synchronous):
+                assert time.monotonic() < deadline
+                time.sleep(0.05)
 
     def start(self) -> None:
         """Returns once it answers."""
+        fast = () if self._durable else ("-F",)
         with (self.root.with_name(f"{self.root.name}.log")).open("ab") as log:
             self.process = subprocess.Popen(
                 [self._programs / "postgres", "-D", self.root / "data", "-p", str(self.port),
-                 "-h", "127.0.0.1", "-k", self.root, "-F"],
+                 "-h", "127.0.0.1", "-k", self.root, *fast],
                 stdout=log, stderr=log, cwd="/", **self._owner,
             )  # fmt: skip
         deadline = time.monotonic() + _TIMEOUT_S
