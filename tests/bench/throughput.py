@@ -1,6 +1,8 @@
 """Throughput of the coordinator: `python tests/bench/throughput.py [--json FILE]`. Prints a table, asserts nothing.
 
-Rows, each with a coordinator process of its own on a state folder of its own, over Zenoh on a unix socket:
+Rows, each with a coordinator process of its own on a state folder of its own, over Zenoh on a unix socket. `--stores
+sqlite,postgresql,standby` plays each with its rows in SQLite, in a PostgreSQL server on this machine, and in two with
+synchronous replication (`remote_apply`), of which all wait for the disk.
 - `slots`: one real worker with two slots and sandboxes on `toy/line`; short episodes, train splits.
 - `one by one`, `batches`: workers that answer at once, taking one lease at a time or sixteen. Every episode is
   committed for itself, durably, and read back by the gateway that submitted it.
@@ -11,6 +13,8 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import itertools
+import os
 import statistics
 import sys
 import tempfile
@@ -155,13 +159,22 @@ async def latency_row(coordinator: Coordinator, n: int) -> dict[str, float]:
     }
 
 
-def on_fresh_coordinator(row: Any, *args: Any) -> dict[str, float]:
-    with tempfile.TemporaryDirectory(prefix="evopolicy-bench-") as folder:
-        coordinator = Coordinator(Path(folder) / "state", "--log-level", "warning")
-        try:
-            return asyncio.run(row(coordinator, *args))
-        finally:
-            coordinator.stop()
+def on_fresh_coordinator(store: str, row: Any, *args: Any) -> dict[str, float]:
+    with contextlib.ExitStack() as stack:
+        folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="evopolicy-bench-"))
+        chosen: tuple[str, ...] = ()
+        if store != "sqlite":
+            from machines.postgres import Server
+
+            server = Server(durable=True)
+            stack.callback(server.close)
+            if store == "standby":
+                stack.callback(Server(durable=True, follows=server).close)
+            os.environ["PGPASSFILE"] = str(server.passfile)
+            chosen = ("--store", server.new())
+        coordinator = Coordinator(Path(folder) / "state", "--log-level", "warning", *chosen)
+        stack.callback(coordinator.stop)
+        return asyncio.run(row(coordinator, *args))
 
 
 def verdict(name: str, row: dict[str, Any]) -> str:
@@ -180,19 +193,22 @@ def main() -> None:
         __doc__,
         episodes=(4096, "episodes in a row of workers that answer at once"),
         rows=("slots,one by one,batches,latency", "rows, comma separated"),
+        stores=("sqlite", "where the rows are, comma separated: sqlite, postgresql, standby"),
         json=(Path, "also write all numbers to this file"),
     )
-    makers = {
-        "slots": lambda: on_fresh_coordinator(slots_row, options.episodes // 8),
-        "one by one": lambda: on_fresh_coordinator(instant_row, options.episodes, 8, 1, 2.0),
-        "batches": lambda: on_fresh_coordinator(instant_row, 2 * options.episodes, 4, 16, 2.0),
-        "latency": lambda: on_fresh_coordinator(latency_row, 200),
+    makers: dict[str, tuple[Any, ...]] = {
+        "slots": (slots_row, options.episodes // 8),
+        "one by one": (instant_row, options.episodes, 8, 1, 2.0),
+        "batches": (instant_row, 2 * options.episodes, 4, 16, 2.0),
+        "latency": (latency_row, 200),
     }
     rows: dict[str, dict[str, Any]] = {}
-    for name in options.rows.split(","):
-        rows[name] = makers[name]()
-        line = "  ".join(f"{key} {value}" for key, value in rows[name].items())
-        print(f"{name:<12}{line}  {verdict(name, rows[name])}", flush=True)
+    for store, name in itertools.product(options.stores.split(","), options.rows.split(",")):
+        found = rows[name if store == "sqlite" else f"{name}, {store}"] = on_fresh_coordinator(
+            store, *makers[name]
+        )
+        line = "  ".join(f"{key} {value}" for key, value in found.items())
+        print(f"{store:<12}{name:<12}{line}  {verdict(name, found)}", flush=True)
     frame.save(options.json, rows)
 
 

@@ -4,13 +4,14 @@ A job's cost is the CPU time of the core and nothing else: the workers here answ
 It must stay flat, and memory must not grow with finished jobs: it is measured in a second pass, after two fifths of
 them (when the core's trace, of fixed size, is full) and at the end.
 
-    python tests/simulation/scale.py [--jobs 1000000] [--workers 10,100,1000,2000]
+    python tests/simulation/scale.py [--jobs 1000000] [--workers 10,100,1000,2000] [--slots 2] [--runs N] [--no-memory]
 """
 
 from __future__ import annotations
 
 import argparse
 import gc
+import resource
 import sys
 import time
 import tracemalloc
@@ -21,6 +22,7 @@ from typing import Any
 sys.path.insert(0, str(Path(__file__).parent))
 sys.path.insert(1, str(Path(__file__).parents[1] / "support"))
 
+import msgspec
 from rigs.asking import asked
 
 from evopolicy_common.messages import gateway, operator
@@ -32,13 +34,13 @@ from evopolicy_coordinator.core.contract.effects import Effect, ReadResults, Rep
 from evopolicy_coordinator.core.contract.records import Snapshot
 from evopolicy_coordinator.core.contract.settings import CoreSettings
 from evopolicy_coordinator.core.machine import Core
+from evopolicy_coordinator.server.reason_texts import words
 
 ENVS = tuple(f"toy/env{index}" for index in range(16))
 EPISODES = 128
 """In a submit."""
 SUBMITS = 4
 """In a run; then it is validated and scored, and another run starts."""
-SLOTS = 2
 EPISODE_S = 2.0
 """Simulated; long enough that leases are granted one by one, the most expensive case."""
 BEAT_S = 2.0
@@ -47,7 +49,8 @@ BEAT_S = 2.0
 class Load:
     """A core under load: workers poll, send heartbeats and report, and gateways submit again as soon as they may."""
 
-    def __init__(self, workers: int, jobs: int, *, memory: bool) -> None:
+    def __init__(self, workers: int, jobs: int, slots: int, runs: int, *, memory: bool) -> None:
+        """`runs` at once; 0: twice as many as keep all slots busy."""
         self.now = 1000.0
         self.core, _ = Core.load(CoreSettings(), Snapshot(incarnation=1), self.now)
         self.jobs, self.done, self.handled = jobs, 0, 0
@@ -62,7 +65,8 @@ class Load:
         self._polls: dict[int, int] = {}
         self._ready: deque[tuple[int, tuple[wire.Lease, ...]]] = deque()
         self._accepted: dict[int, int] = {}
-        self._runs = max(2, min(2 * workers * SLOTS // EPISODES + 16, jobs // EPISODES))
+        self._slots = slots
+        self._runs = runs or max(2, min(2 * workers * slots // EPISODES + 16, jobs // EPISODES))
         self._created = 0
         self._submitted: dict[str, int] = {}
         """Number of submits so far of each open run."""
@@ -105,7 +109,7 @@ class Load:
         fingerprint = wire.Fingerprint(code_version="1", python="3", packages={}, cpu="")
         for index, name in enumerate(self._names):
             offered = {"tiers": ("bwrap",), "environments": descriptions, "fingerprint": fingerprint}
-            self._ask_as(index, wire.Register, slots=SLOTS, boot_id=f"kernel-of-{name}", **offered)
+            self._ask_as(index, wire.Register, slots=self._slots, boot_id=f"kernel-of-{name}", **offered)
         for _ in range(self._runs):
             self._create()
         for index in range(len(self._names)):
@@ -150,7 +154,7 @@ class Load:
 
     def _poll(self, worker: int) -> None:
         self._polls[self._requests + 1] = worker
-        self._ask_as(worker, wire.LeaseRequest, n=SLOTS, wait_s=30.0)
+        self._ask_as(worker, wire.LeaseRequest, n=self._slots, wait_s=30.0)
 
     def _beat(self, worker: int) -> None:
         self._ask_as(worker, wire.Heartbeat, held=tuple(self._held[worker].values()))
@@ -226,28 +230,46 @@ class Load:
         if self._measure:
             tracemalloc.stop()
 
+    def status(self) -> tuple[float, int]:
+        """CPU time of an operator's status, and its size as a message."""
+        began = time.process_time()
+        size = len(msgspec.msgpack.encode(self.core.status(self.now, words)))
+        return time.process_time() - began, size
+
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
     parser.add_argument("--jobs", type=int, default=100_000, help="jobs in all (100000)")
     parser.add_argument("--workers", default="10,100,1000,2000", help="fleets to try (10,100,1000,2000)")
+    parser.add_argument("--slots", type=int, default=2, help="of each worker (2)")
+    parser.add_argument("--runs", type=int, default=0, help="at once (twice as many as keep all slots busy)")
+    parser.add_argument("--no-memory", action="store_true", help="leave out the pass that traces memory")
     options = parser.parse_args()
-    print("workers    jobs  core µs/job  events/job  longest event ms  memory early KiB  late KiB")
+    print(
+        "workers    jobs  core µs/job  events/job  longest event ms  status ms      KiB  memory early KiB  late KiB"
+    )
     costs = []
     for workers in [int(each) for each in options.workers.split(",")]:
         # CPU time in one pass, memory in another, since tracing memory is slow.
-        load, watched = (Load(workers, options.jobs, memory=memory) for memory in (False, True))
-        for each in (load, watched):
+        passes = [
+            Load(workers, options.jobs, options.slots, options.runs, memory=memory)
+            for memory in (False, True)[: 1 if options.no_memory else 2]
+        ]
+        for each in passes:
             each.start()
             gc.collect()
             each.run()
+        load = passes[0]
         costs.append(1e6 * load.cpu_s / load.done)
-        early, late = (size / 1024 for size in watched.memory)
+        status_s, status_bytes = load.status()
+        early, late = (size / 1024 for size in passes[-1].memory or (0, 0))
         print(
             f"{workers:7d} {load.done:7d} {costs[-1]:12.1f} {load.handled / load.done:11.2f} "
-            f"{1e3 * load.longest_s:17.2f} {early:17.0f} {late:9.0f}",
+            f"{1e3 * load.longest_s:17.2f} {1e3 * status_s:10.0f} {status_bytes / 1024:8.0f} {early:17.0f} {late:9.0f}",
             flush=True,
         )
+    peak_mib = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    print(f"peak of the process, with its clients: {peak_mib:.0f} MiB")
     print(f"dearest / cheapest per job: {max(costs) / min(costs):.2f} (wanted: at most 1.5)")
     return 0 if max(costs) <= 1.5 * min(costs) else 1
 

@@ -156,7 +156,7 @@ class SimGateway(Asker):
                 return
             self._over()  # the run is finished or cancelled
             return
-        self.simulation.truth.asked_at.setdefault(self.plan.name, self.world.now)
+        self.simulation.truth.asks(self.plan)
         self._ask_permit()
 
     def _over(self) -> None:

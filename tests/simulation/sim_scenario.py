@@ -30,7 +30,7 @@ HIDDEN_WAIT_S = 20.0
 AGENT_WAIT_S = 300.0
 """Longer than any honest agent lives; in a crowd, which has no hostile gateway, much longer."""
 PERMIT_S = 400.0
-"""Longest time that an agent waits for its permit without faults, seconds."""
+"""Longest time that an agent waits for its permit without faults while no hidden episode is played, seconds."""
 ENVS = ("toy/line", "toy/maze")
 KINDS = ("good",) * 7 + ("raises", "raises", "none", "late")
 
@@ -331,10 +331,12 @@ class Simulation:
         self.world.calm_at = self.world.now
         self.world.run(self.world.now + 20.0, lambda: False)
         self.checkers.ended(self.coordinator.core)
-        most_s = min(PERMIT_S, self.story.permit_s)
-        longest_s = max(self.truth.waited_s, default=0.0)
-        if self.faults == Faults() and not (self.hostile or self.truth.agents) and longest_s > most_s:
-            raise ViolationError(f"an agent waits {longest_s:.0f} s for its permit")
+        for waited_s, idle_s in self.truth.waited_s:
+            late = waited_s > self.story.permit_s or idle_s > PERMIT_S
+            if self.faults == Faults() and not (self.hostile or self.truth.agents) and late:
+                raise ViolationError(
+                    f"an agent waits {waited_s:.0f} s for its permit, {idle_s:.0f} s of them while nothing is scored"
+                )
 
     def over(self) -> bool:
         """Whether all runs have ended."""

@@ -47,10 +47,13 @@ class Truth:
         """By worker and lease: boot id, run, and `hidden` or `train`."""
         self.kept_since: dict[str, float] = {}
         """Closed, unfinished run to the time since when a related agent has been alive without a break."""
-        self.asked_at: dict[str, float] = {}
-        """When a run's gateway first requested its permit."""
-        self.waited_s: list[float] = []
-        """Seconds that agents waited for permits."""
+        self.asked_at: dict[str, tuple[float, float]] = {}
+        """When a run's gateway first requested its permit, and `_scored_s` then."""
+        self.waited_s: list[tuple[float, float]] = []
+        """Seconds that agents waited for permits, and of them those in which no hidden episode was played."""
+        self._scored_s = 0.0
+        """Seconds in which hidden episodes were played, up to `_scored_at`."""
+        self._scored_at = 0.0
 
     # ---- agents ----
 
@@ -62,12 +65,25 @@ class Truth:
         self._not_after_others(plan)
         self.agents[plan.name, boot_id] = plan
         self._look()
-        self.waited_s.append(world.now - self.asked_at.pop(plan.name, world.now))
+        if plan.name in self.asked_at:
+            at, scored_s = self.asked_at.pop(plan.name)
+            self.waited_s.append((world.now - at, world.now - at - (self._scored() - scored_s)))
         for (worker, lease), (where, run, kind) in self.plays.items():
             if where == boot_id and kind == "hidden" and plan.related(run):
                 raise SharedKernelError(
                     f"the agent of {plan.name} starts on {boot_id} while {worker} plays {lease}"
                 )
+
+    def asks(self, plan: PlannedRun) -> None:
+        self.asked_at.setdefault(plan.name, (self._simulation.world.now, self._scored()))
+
+    def _scored(self) -> float:
+        """Counts the time since the last call, in which the same episodes were played."""
+        now = self._simulation.world.now
+        if any(kind == "hidden" for _, _, kind in self.plays.values()):
+            self._scored_s += now - self._scored_at
+        self._scored_at = now
+        return self._scored_s
 
     def agent_ends(self, plan: PlannedRun, boot_id: str | None = None) -> None:
         for key in [key for key in self.agents if key[0] == plan.name and boot_id in (None, key[1])]:
@@ -118,6 +134,7 @@ class Truth:
         if plan is None or not (hidden or train):
             return
         kind = "hidden" if hidden else "train"
+        self._scored()
         self.plays[worker, lease.lease_id] = boot_id, plan, kind
         for (other, at), agent in self.agents.items():
             if hidden and at == boot_id and agent.related(plan):
@@ -131,8 +148,10 @@ class Truth:
                 )
 
     def play_ends(self, worker: str, lease_id: str) -> None:
+        self._scored()
         self.plays.pop((worker, lease_id), None)
 
     def worker_dies(self, worker: str) -> None:
+        self._scored()
         for key in [key for key in self.plays if key[0] == worker]:
             del self.plays[key]
