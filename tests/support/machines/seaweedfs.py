@@ -14,11 +14,10 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
-import obstore
-import obstore.exceptions
-import obstore.store
 import pytest
 
+# Modules of tests that import this one are skipped without it.
+obstore = pytest.importorskip("obstore", reason="needs obstore: make install")
 BUCKET = "evp"
 _PORTS = ("master.port", "master.port.grpc", "volume.port", "volume.port.grpc", "filer.port", "filer.port.grpc",
           "s3.port", "s3.port.grpc")  # fmt: skip
