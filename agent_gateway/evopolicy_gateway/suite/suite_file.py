@@ -135,7 +135,17 @@ def read(name: str) -> SuiteFile:
     return suite
 
 
-_TABLES = (SuiteFile, AgentTable, RunTable, Override, Parallel, Caps, JailSettings, AgentConfig)
+_TABLES: dict[type[msgspec.Struct], str] = {
+    SuiteFile: "the top of the file",
+    RunTable: "[defaults], [agents.run], or [[overrides]]",
+    AgentTable: "[[agents]]",
+    Override: "[[overrides]]",
+    Parallel: "[parallel]",
+    Caps: "[caps]",
+    JailSettings: "[agents.jail]",
+    AgentConfig: "[agents.config]",
+}
+"""Where each belongs. A key that several have belongs to the first."""
 
 
 def _explained(problem: str, text: str) -> str:
@@ -147,6 +157,13 @@ def _explained(problem: str, text: str) -> str:
     ]
     place = f", line {numbers[0]}" if len(numbers) == 1 else ""
     known = {field.encode_name: field.type for table in _TABLES for field in msgspec.structs.fields(table)}
+    if unknown and key in known:
+        place_of_key = next(
+            where
+            for table, where in _TABLES.items()
+            if key in {f.encode_name for f in msgspec.structs.fields(table)}
+        )
+        return f"{place}: {problem}; `{key}` belongs in {place_of_key}"
     if unknown:
         near = difflib.get_close_matches(key, known, 1)
         return f"{place}: {problem}" + (f"; did you mean {near[0]}?" if near else "")

@@ -86,7 +86,8 @@ def web(
         _check_certificate(tls_certificate)
     for folder in runs or ():
         if not folder.is_dir():
-            raise ConfigError(f"{folder} is not a folder; name a folder of runs, such as runs")
+            problem = "is not a folder" if folder.exists() else "does not exist"
+            raise ConfigError(f"{folder} {problem}; name a folder with runs")
     roots = runs or [folder for folder in (Path("runs"),) if folder.is_dir()]
     token = drawn_token() if token_file is None else kept_token(token_file)
     known = _credentials(tuple(connect or ()), file)

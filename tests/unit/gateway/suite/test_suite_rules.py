@@ -105,6 +105,7 @@ def test_operational_settings_do_not_make_another_run(tmp_path: Path) -> None:
     ("text", "message"),
     [
         ("name = 's'", "environments"),
+        ("repeats = 2\n" + FILE, r"`repeats`; `repeats` belongs in \[defaults\]"),
         (FILE.replace("budget = 8", "budgte = 8"), r"line \d+: .*`budgte` .*; did you mean budget\?"),
         (
             FILE.replace("budget = 8", 'video = "some"'),
