@@ -167,8 +167,8 @@ def _apart(tied: Sequence[str], n_others: int) -> str:
     if not n_others:
         return "There is no other agent to compare with."
     if not tied:
-        return "The difference to every other agent is significant at 5\N{NO-BREAK SPACE}%."
-    return f"Not told apart from it at 5\N{NO-BREAK SPACE}%: {_names(tied)}."
+        return "The difference to every other agent is significant at 5 %."
+    return f"Not told apart from it at 5 %: {_names(tied)}."
 
 
 def _cost(runs: Sequence[Run]) -> str:
