@@ -16,7 +16,7 @@ Calls that play have an async twin with the suffix `_async`. Names that start wi
 
 from __future__ import annotations
 
-from evopolicy._arguments import RunOptions
+from evopolicy._arguments import RunKeywords
 from evopolicy._cluster import Cluster, evaluate, evaluate_async, run, run_async
 from evopolicy._evaluation import Episode, Evaluation
 from evopolicy._records import Records
@@ -34,7 +34,7 @@ __all__ = [
     "EvopolicyError",
     "Records",
     "Run",
-    "RunOptions",
+    "RunKeywords",
     "RunSummary",
     "Runs",
     "SubmitRecord",

@@ -29,7 +29,7 @@ from evopolicy_gateway.run.run_options import limits_from
 AnyPath = str | os.PathLike[str]
 
 
-class RunOptions(TypedDict, total=False):
+class RunKeywords(TypedDict, total=False):
     """Further keywords of `evopolicy.run`, as the options of `evopolicy run` with these names:"""
 
     # For type checkers and editors, which cannot see the declarations in `run_options`. A test compares them.
@@ -71,7 +71,7 @@ class RunOptions(TypedDict, total=False):
 
 
 class Rule(NamedTuple):
-    take: Callable[[Any], Any]
+    checked: Callable[[Any], Any]
     """Returns the value as it is used. Raises TypeError or ValueError for one that cannot be."""
     words: str
     """Completes the sentence "give …"."""
@@ -80,12 +80,12 @@ class Rule(NamedTuple):
 def _checked(kind: type[Any], *, filled: bool = False) -> Callable[[Any], Any]:
     """Takes values of a type; `filled`: not an empty one."""
 
-    def take(value: Any) -> Any:
+    def checked(value: Any) -> Any:
         if not isinstance(value, kind) or (filled and not value):
             raise TypeError
         return value
 
-    return take
+    return checked
 
 
 _text = _checked(str, filled=True)
@@ -96,23 +96,23 @@ def _path(value: Any) -> Path:
 
 
 def _whole(least: int) -> Callable[[Any], int]:
-    def take(value: Any) -> int:
+    def checked(value: Any) -> int:
         number = index(value)  # numpy's integers too
         if isinstance(value, bool) or number < least:
             raise ValueError
         return number
 
-    return take
+    return checked
 
 
 def _least(least: float) -> Callable[[Any], float]:
-    def take(value: Any) -> float:
+    def checked(value: Any) -> float:
         number = float(value)
         if isinstance(value, str | bool) or not least <= number < math.inf:
             raise ValueError
         return number
 
-    return take
+    return checked
 
 
 def _agent(value: Any) -> Any:
@@ -144,16 +144,16 @@ def _limits(value: Any) -> ResourceLimits:
 def _choice(kind: Any) -> Rule:
     allowed = get_args(kind)
 
-    def take(value: Any) -> Any:
+    def checked(value: Any) -> Any:
         if value not in allowed:
             raise ValueError
         return value
 
-    return Rule(take, " or ".join(map(repr, allowed)))
+    return Rule(checked, " or ".join(map(repr, allowed)))
 
 
 def _or_none(rule: Rule) -> Rule:
-    return Rule(lambda value: None if value is None else rule.take(value), f"{rule.words}, or None")
+    return Rule(lambda value: None if value is None else rule.checked(value), f"{rule.words}, or None")
 
 
 _FOLDER = Rule(_path, "the path of a folder")
@@ -186,7 +186,7 @@ def _rule(one: Declared) -> Rule:
 
 OPTIONS = {one.name: one for one in declared(run_options.RunOptions).values() if one.option.python}
 _HELPS = (f"`{one.name}`: {one.help}" for one in OPTIONS.values() if one.name != "agent")
-RunOptions.__doc__ = "\n".join([f"{RunOptions.__doc__}\n", *_HELPS])
+RunKeywords.__doc__ = "\n".join([f"{RunKeywords.__doc__}\n", *_HELPS])
 RULES: dict[str, Rule] = {
     **{name: _rule(one) for name, one in OPTIONS.items()},
     "agent": Rule(_agent, "a function of one Workspace, or a text as for --agent, such as 'evolve'"),
@@ -208,14 +208,14 @@ RULES: dict[str, Rule] = {
 
 def taken(**given: Any) -> dict[str, Any]:
     """The arguments as they are used. Raises ConfigError that names the first wrong one."""
-    return {name: take(name, value) for name, value in given.items()}
+    return {name: check_argument(name, value) for name, value in given.items()}
 
 
-def take(name: str, value: Any) -> Any:
+def check_argument(name: str, value: Any) -> Any:
     """As `taken`, for one argument."""
     rule = RULES[name]
     try:
-        return rule.take(value)
+        return rule.checked(value)
     except (TypeError, ValueError, OverflowError):
         raise ConfigError(f"{name} is {reprlib.repr(value)}: give {rule.words}") from None
 

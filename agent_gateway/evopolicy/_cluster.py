@@ -13,7 +13,7 @@ from typing import Any, Self, TypeVar, Unpack
 
 from rich.progress import Progress
 
-from evopolicy._arguments import OPTIONS, AnyPath, RunOptions, check_names, take, taken
+from evopolicy._arguments import OPTIONS, AnyPath, RunKeywords, check_argument, check_names, taken
 from evopolicy._evaluation import Episode, Evaluation, episode_of
 from evopolicy._functions import agent_of, name_of, policy_of
 from evopolicy._loop import awaited, call, loop, twins
@@ -105,8 +105,8 @@ class Cluster:
         `credentials`: the folder written by `evopolicy-coordinator certs issue operator`. Without arguments it is the
         cluster of this machine.
         """
-        connect = tuple(take("endpoint", endpoint) for endpoint in endpoints)
-        return cls(operator.Cluster(connect=connect, file=take("credentials", credentials)))
+        connect = tuple(check_argument("endpoint", endpoint) for endpoint in endpoints)
+        return cls(operator.Cluster(connect=connect, file=check_argument("credentials", credentials)))
 
     def open(self) -> Self:
         """Starts or connects to the cluster, for notebooks. `close` ends it, and so does the end of the process."""
@@ -154,7 +154,7 @@ class Cluster:
         Raises ConfigError, with the remedy, for wrong arguments and for missing requirements on this machine.
         """
         trial = await asyncio.to_thread(trial_of, policy, env, cases, tier, limits)
-        return await self._evaluated(trial, take("progress", progress))
+        return await self._evaluated(trial, check_argument("progress", progress))
 
     async def _run(
         self,
@@ -162,10 +162,10 @@ class Cluster:
         env: str,
         agent: str | AgentFunction,
         progress: bool = True,
-        **options: Unpack[RunOptions],
+        **options: Unpack[RunKeywords],
     ) -> Run:
         """Plays one run on this cluster; arguments as for `evopolicy.run` without `slots` and `policy_packages`."""
-        take("progress", progress)
+        check_argument("progress", progress)
         with contextlib.ExitStack() as stack:
             plan = await self._planned(stack, env, agent, options)
             return await self._play(plan, progress)
@@ -240,11 +240,11 @@ class Cluster:
         return await self._on(env, message.sandbox_tier, work)
 
     async def _planned(
-        self, stack: contextlib.ExitStack, env: str, agent: str | AgentFunction, options: RunOptions
+        self, stack: contextlib.ExitStack, env: str, agent: str | AgentFunction, options: RunKeywords
     ) -> Plan:
         """The checked plan of a run; `stack` holds the folder of an agent's function."""
         check_installed("gateway")
-        take("agent", agent)
+        check_argument("agent", agent)
         if callable(agent):
             options = {**options, "entry": options.get("entry") or name_of(agent)}
             folder = stack.enter_context(scratch_folder("function"))
@@ -263,7 +263,7 @@ class Cluster:
             with RunView(terminal(stderr=True) if progress else None).shown() as watch:
                 lifecycle = RunLifecycle(plan, reached.operations, reached.gateway, watch)
                 started(lifecycle)
-                await lifecycle.play()
+                await lifecycle.play_run()
             return await asyncio.to_thread(read_run, plan.folder.root)
 
         return await self._on(plan.settings.env, plan.settings.sandbox_tier, work)
@@ -289,7 +289,7 @@ def plan_of(
     """The plan of a run; arguments as for `run`, and for an agent that is started elsewhere as in `Plan`. Raises
     ConfigError."""
     check_names(options, OPTIONS.keys() - {"agent"})
-    env = one_environment(take("env", env))
+    env = one_environment(check_argument("env", env))
     given = run_options.RunOptions(
         agent=agent, **{name: value for name, value in taken(**options).items() if value is not None}
     )
@@ -334,7 +334,7 @@ async def _run(
     slots: int = 2,
     policy_packages: Iterable[str] = (),
     progress: bool = True,
-    **options: Unpack[RunOptions],
+    **options: Unpack[RunKeywords],
 ) -> Run:
     """Plays one whole run, up to its score, on a local cluster.
 
@@ -351,7 +351,7 @@ async def _run(
     Raises ConfigError, with the remedy, for wrong arguments and for missing requirements on this machine. Ctrl-C
     cancels the run, and its folder records that.
     """
-    take("progress", progress)
+    check_argument("progress", progress)
     cluster = Cluster.local(slots, policy_packages=policy_packages)
     with contextlib.ExitStack() as stack:
         # Before the cluster is opened: a wrong argument starts no process.

@@ -11,7 +11,7 @@ from typing import Any
 
 import msgspec
 
-from evopolicy._arguments import take
+from evopolicy._arguments import check_argument
 from evopolicy._records import Records, bars
 from evopolicy_common.errors import DECODE_ERRORS, ConfigError, ProtocolError
 from evopolicy_common.records.policies.submits import read_submits
@@ -259,7 +259,7 @@ def load_runs(*paths: str | os.PathLike[str]) -> Runs:
     """
     if not paths:
         raise ConfigError("load_runs needs a folder, such as runs/")
-    folders, without = run_folders(take("folder", path) for path in paths)
+    folders, without = run_folders(check_argument("folder", path) for path in paths)
     if without:
         raise ConfigError(no_run_below(without[0]))
     runs, left_out = [], []

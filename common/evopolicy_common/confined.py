@@ -47,7 +47,7 @@ class Confined:
         except (OSError, ValueError) as error:
             raise NotThereError(path) from error
 
-    def read(self, path: str, limit: int) -> bytes:
+    def read_file(self, path: str, limit: int) -> bytes:
         """At most `limit` bytes of a regular file; empty for a refused path."""
         try:
             with os.fdopen(self.open(path), "rb") as file:

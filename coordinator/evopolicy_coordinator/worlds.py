@@ -59,8 +59,8 @@ class Candidate(msgspec.Struct, frozen=True, kw_only=True, tag="candidate", tag_
     accepted: bool
 
 
-Entry = Base | Candidate
-_entries: msgspec.json.Decoder[Entry] = msgspec.json.Decoder(Entry)
+WorldEntry = Base | Candidate
+_entries: msgspec.json.Decoder[WorldEntry] = msgspec.json.Decoder(WorldEntry)
 
 
 def loses(base: Base, canonical: float) -> bool:
@@ -89,7 +89,7 @@ def number_of(env: str, secret: bytes, journal: Path | None) -> tuple[int, str]:
     """The candidate that a world of this epoch has, and the digest (SHA-256, hex) of the trials that chose it; empty
     without any. Raises ConfigError if too few were accepted, or the trials are not those of `accept-worlds`."""
     place = ids(unchanged(env)).index(env)
-    tried = [] if journal is None else of_environment(read(journal), epoch_of(secret), unchanged(env))
+    tried = [] if journal is None else of_environment(read_journal(journal), epoch_of(secret), unchanged(env))
     if not tried:
         return place, ""
     candidates = [each for each in tried if isinstance(each, Candidate)]
@@ -108,11 +108,11 @@ def number_of(env: str, secret: bytes, journal: Path | None) -> tuple[int, str]:
     return accepted[place], digest(b"".join(msgspec.json.encode(each) + b"\n" for each in tried))
 
 
-def of_environment(entries: list[Entry], epoch: str, env: str) -> list[Entry]:
+def of_environment(entries: list[WorldEntry], epoch: str, env: str) -> list[WorldEntry]:
     return [each for each in entries if each.epoch == epoch and each.env == env]
 
 
-def read(journal: Path) -> list[Entry]:
+def read_journal(journal: Path) -> list[WorldEntry]:
     """All entries; none where there is no journal. Raises ConfigError for a damaged one."""
     try:
         return [_entries.decode(line) for line in journal.read_bytes().splitlines()]
@@ -122,7 +122,7 @@ def read(journal: Path) -> list[Entry]:
         raise ConfigError(f"{journal} is no journal of worlds: {error}; restore it from a backup") from error
 
 
-def append(journal: Path, entry: Entry) -> None:
+def append(journal: Path, entry: WorldEntry) -> None:
     """Adds an entry, durably."""
-    lines = [msgspec.json.encode(each) + b"\n" for each in [*read(journal), entry]]
+    lines = [msgspec.json.encode(each) + b"\n" for each in [*read_journal(journal), entry]]
     write_atomically(journal, b"".join(lines), mode=0o600)

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from evopolicy_common import catalogue
-from evopolicy_worker.check_env import COLUMNS, read
+from evopolicy_worker.check_env import COLUMNS, read_checked
 
 FOLDER = Path(__file__).parents[1] / "reference" / "environments"
 MARK = "<!-- What follows is written by `make check-envs`. -->"
@@ -47,7 +47,7 @@ def page(results: Path | None, earlier: str = "", ids: Sequence[str] | None = No
     """A Markdown table of the results in a file, with the number of environments played. `earlier`: a text whose rows
     stay where the file has none. `ids`: the environments, in order; by default the catalogue's."""
     rows = table(earlier)
-    for env, each in (read(results) if results else {}).items():
+    for env, each in (read_checked(results) if results else {}).items():
         rows[env] = each.cells()[1:]
     ids = list(catalogue.entries()) if ids is None else ids
     body = [f"| `{each}` | {' | '.join(rows[each])} |" for each in ids if each in rows]

@@ -157,11 +157,11 @@ async def slot_time(env: str, n: int, *, accelerations: bool) -> tuple[float, in
         slot = Slot(core, "bwrap", Path(folder) / "slot")
         await slot.start()
         try:
-            await slot.play(jobs(env, 1)[0], bundle, lambda done, steps: None)
+            await slot.play_job(jobs(env, 1)[0], bundle, lambda done, steps: None)
             steps, times = 0, []
             for index, job in enumerate(jobs(env, max(n, SINGLES))):
                 started = time.perf_counter()
-                (outcome,) = await slot.play(job, bundle, lambda done, steps: None)
+                (outcome,) = await slot.play_job(job, bundle, lambda done, steps: None)
                 times.append(time.perf_counter() - started)
                 steps += outcome.length if index < n else 0
             return sum(times[:n]), steps, times[:SINGLES], peak_memory_mb()

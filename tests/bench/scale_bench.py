@@ -122,7 +122,7 @@ class AnsweringSlot:
 
     async def close(self) -> None: ...
 
-    async def play(
+    async def play_job(
         self, job: Job, bundle: Path | None, on_progress: Callable[[int, int], None]
     ) -> tuple[EpisodeOutcome, ...]:
         outcomes = []
@@ -139,7 +139,7 @@ async def answer(options: Any) -> None:
     folder: Path = options.answer
     outcomes = msgspec.msgpack.decode((folder / "outcomes").read_bytes(), type=Outcomes)
     outcomes = msgspec.structs.replace(outcomes, pace_s=options.pace)
-    found = credentials.read(folder / "worker.json")
+    found = credentials.read_credentials(folder / "worker.json")
     async with contextlib.AsyncExitStack() as stack:
         tasks = []
         for number in range(options.workers):
@@ -315,7 +315,11 @@ def play_really(coordinator: Coordinator, env: str, folder: Path, n: int) -> Pla
         outcome = row.outcome
         ref = outcome.trajectory
         assert ref is not None
-        whole = ref if ref.inline is not None else msgspec.structs.replace(ref, inline=blobs.read(ref.digest))
+        whole = (
+            ref
+            if ref.inline is not None
+            else msgspec.structs.replace(ref, inline=blobs.read_blob(ref.digest))
+        )
         reply = slot_messages.Finished(outcome=msgspec.structs.replace(outcome, trajectory=whole))
         by_seed[stored.train[ids[row.index]].seed] = slot_messages.encoder.encode(reply)
     # The hidden cases of the runs to come are answered like a case that was played.

@@ -58,7 +58,7 @@ def test_the_longest_episode_is_recorded_to_its_limit(
     entry = msgspec.structs.replace(catalogue.entry(env), id=f"long/{name}", wrappers=(WRAPPER,))
     with slots.running(Slot(None, "bwrap", slots.folder / "long", definitions=(entry,))) as slot:
         job = make_job(env=entry.id, bundle=None, limits=ResourceLimits(), render=True)
-        (outcome,) = slots.run(slot.play(job, None, lambda episodes, steps: None), timeout_s=500.0)
+        (outcome,) = slots.run(slot.play_job(job, None, lambda episodes, steps: None), timeout_s=500.0)
         peak = peak_mb(pid_of(slot))
     assert (outcome.length, outcome.truncated, outcome.failure) == (steps, True, None)
     assert outcome.trajectory is not None

@@ -56,7 +56,7 @@ def test_a_policy_beats_random_on_the_cases_that_were_fixed_beforehand(slots: Sl
                 max_steps=proof.steps,
                 record="actions",
             )
-            (outcome,) = slots.run(slots.slot().play(job, folder, lambda episodes, steps: None))
+            (outcome,) = slots.run(slots.slot().play_job(job, folder, lambda episodes, steps: None))
             assert outcome.failure is None, outcome.failure
             found.append(outcome.episode_return)
         return np.array(found)

@@ -270,7 +270,7 @@ class FaultCluster:
 
     @property
     def operators(self) -> credentials.Credentials:
-        return credentials.read(Path(self.files["operator"]))
+        return credentials.read_credentials(Path(self.files["operator"]))
 
     def command(self, name: str) -> subprocess.Popen[str]:
         """A run that has been started, or after its command was killed: that is gone on with."""

@@ -30,7 +30,7 @@ def test_a_repeated_command_completes_the_same_journal(tmp_path: Path) -> None:
     assert played.returncode == 0, played.stderr
     state = tmp_path / "state"
     journal = (state / JOURNAL).read_bytes()
-    base, *tried = worlds.read(state / JOURNAL)
+    base, *tried = worlds.read_journal(state / JOURNAL)
     assert isinstance(base, Base)
     assert base.random is not None
     assert base.canonical is not None
@@ -65,4 +65,4 @@ def test_an_environment_without_a_policy_is_told_and_not_accepted(tmp_path: Path
     played = accept(tmp_path, "gym/continuouscar", "--policies", ".")
     assert played.returncode == 0, played.stderr
     assert "no policy is known, so no world is accepted" in played.stdout
-    assert [type(each) for each in worlds.read(tmp_path / "state" / JOURNAL)] == [Base]
+    assert [type(each) for each in worlds.read_journal(tmp_path / "state" / JOURNAL)] == [Base]

@@ -108,7 +108,7 @@ BUGS = (
     Bug(
         "skip the fencing",
         results,
-        "take",
+        "take_results",
         "live = lease is not None and lease.live and job.lease is lease",
         "live = True",
         seed=13,
@@ -298,7 +298,7 @@ BUGS = (
         "kernel = permits.place(run, message.boot_id)",
         "kernel = permits.place(run, message.boot_id);"
         " [permits._end(state, there, row, step, '') for each in list(state.permits)"
-        " for there, row in permits.held(state, each)"
+        " for there, row in permits.permits_of_run(state, each)"
         " if row.host == message.host and row.boot_id != message.boot_id]",
         seed=145,
     ),
@@ -308,9 +308,9 @@ BUGS = (
         "registered",
         "occupancies.joined(state, worker, step)",
         "occupancies.joined(state, worker, step);"
-        " permits = __import__('evopolicy_coordinator.core.agents.permits', fromlist=['held']);"
+        " permits = __import__('evopolicy_coordinator.core.agents.permits', fromlist=['permits_of_run']);"
         " [permits._end(state, there, row, step, '') for each in list(state.permits)"
-        " for there, row in permits.held(state, each)"
+        " for there, row in permits.permits_of_run(state, each)"
         " if row.host == worker.host and row.boot_id != message.boot_id]",
         seed=19,
     ),

@@ -28,7 +28,7 @@ from evopolicy_coordinator.core.contract.records import (
 )
 from evopolicy_coordinator.core.leasing import fleet
 from evopolicy_coordinator.core.machine import Core
-from evopolicy_coordinator.server.reason_texts import words
+from evopolicy_coordinator.server.reason_texts import reason_text
 
 if TYPE_CHECKING:
     from sim_scenario import Simulation
@@ -343,7 +343,7 @@ class Checkers:
         self._steps += 1
         quiet_s = self._simulation.world.now - max(self._moved_at, self._simulation.world.calm_at)
         if quiet_s > QUIET_S:
-            status = core.status(self._simulation.world.now, words)
+            status = core.status(self._simulation.world.now, reason_text)
             want(False, "it goes on", f"no commit for {quiet_s:.0f} s", status.runs, status.stalls)
         for flow in core.state.unpinned.values():
             want(fleet.offer(core.state, flow) is None, "only runs without workers are unpinned", flow.id)

@@ -22,7 +22,7 @@ from evopolicy_common.messages.episode import EpisodeSpec, Job
 from evopolicy_common.messages.operator import SetWorker
 from evopolicy_coordinator.core.contract import events
 from evopolicy_coordinator.core.contract.settings import CoreSettings
-from evopolicy_coordinator.server.reason_texts import words
+from evopolicy_coordinator.server.reason_texts import reason_text
 
 HORIZON_S = 1500.0
 """Simulated seconds after which an unfinished run counts as stuck."""
@@ -326,7 +326,7 @@ class Simulation:
         if not finished:
             missing = {plan.name for plan in self.plans} - self.checkers.finished_runs
             core = self.coordinator.core
-            status = None if core is None else core.status(self.world.now, words)
+            status = None if core is None else core.status(self.world.now, reason_text)
             raise ViolationError(f"runs that never finish: {sorted(missing)}; {status}")
         self.world.calm_at = self.world.now
         self.world.run(self.world.now + 20.0, lambda: False)

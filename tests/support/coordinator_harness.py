@@ -84,7 +84,7 @@ class Coordinator:
         self.ready: dict[str, Any] = json.loads(self.ready_file.read_text())
 
     def credentials(self, role: Role) -> Credentials:
-        return credentials.read(Path(self.ready["credentials"][role]))
+        return credentials.read_credentials(Path(self.ready["credentials"][role]))
 
     def kill(self) -> None:
         """SIGKILL: nothing is said, nothing is flushed."""

@@ -50,7 +50,7 @@ class Results:
         for exp_id in ("first", "second"):
             evopolicy(root, "local", "--env", ENV, *numbers, *own, "--exp-id", exp_id, code=0)
         self.summary = self.publish("all.evp", "runs")
-        self.files = self.read("all.evp")
+        self.files = self.read_file("all.evp")
 
     def publish(self, out: str, *runs: str) -> dict[str, Any]:
         state = ("--local", "--state", "st", "--json")
@@ -58,7 +58,7 @@ class Results:
         document: dict[str, Any] = json.loads(done.stdout)
         return document
 
-    def read(self, name: str) -> dict[str, bytes]:
+    def read_file(self, name: str) -> dict[str, bytes]:
         return read(self.root / name)
 
     def run_folder(self, exp_id: str) -> str:
@@ -75,7 +75,7 @@ class Held:
     def names(self) -> frozenset[str]:
         return frozenset(self.files)
 
-    def read(self, name: str, most: int) -> bytes:
+    def read_file(self, name: str, most: int) -> bytes:
         if name not in self.files:
             raise ProtocolError(f"{name} is missing")
         return self.files[name]
@@ -257,7 +257,7 @@ def written(path: Path, files: dict[str, bytes]) -> Path:
 def read(path: Path) -> dict[str, bytes]:
     """The files of an archive."""
     with Archive(path) as archive:
-        return {each: archive.read(each, 1 << 30) for each in archive.names}
+        return {each: archive.read_file(each, 1 << 30) for each in archive.names}
 
 
 FORGER = Ed25519PrivateKey.from_private_bytes(b"f" * 32)

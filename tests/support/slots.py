@@ -156,7 +156,7 @@ class Slots:
         job = make_job(bundle=None if policy is None else "digest", tier=tier, **options)
         folder = None if policy is None else self.bundle(policy)
         slot = slot or self.slot(tier, sealed=sealed, packages=packages)
-        return self.run(slot.play(job, folder, lambda episodes, steps: None))
+        return self.run(slot.play_job(job, folder, lambda episodes, steps: None))
 
     def play(self, policy: dict[str, str | bytes] | str | None, **options: Any) -> EpisodeOutcome:
         """The outcome of one episode; not the first of its submit unless `first=0`."""
@@ -269,7 +269,7 @@ async def begun(
         nonlocal taken
         taken = steps
 
-    task = asyncio.create_task(slot.play(job, slots.bundle(policy), note))
+    task = asyncio.create_task(slot.play_job(job, slots.bundle(policy), note))
     # Another process may compile the policy first, so without a step yet, the same one has to be there for a while.
     last, same = 0, 0
     while not taken and same < 50:

@@ -144,7 +144,7 @@ async def _in_a_slot(env_id: str, tier: Tier, definitions: tuple[Entry, ...]) ->
             (description,) = await slot.describe([env_id])
             action = literal(compile_actions(description.action_space).neutral())
             (bundle / "policy.py").write_text(_POLICY + repr(action))
-            (outcome,) = await slot.play(_job(description, tier), bundle, lambda episodes, steps: None)
+            (outcome,) = await slot.play_job(_job(description, tier), bundle, lambda episodes, steps: None)
             if outcome.failure is not None:
                 raise WorkerError(outcome.failure.message[:200])
             return InASlot(memory_mb=slot.memory_bytes() >> 20, notes=description.notes())
@@ -209,7 +209,7 @@ def command(
         if results is not None:
             check_writable(results.parent, "--results")
             results.parent.mkdir(parents=True, exist_ok=True)
-        known = {} if results is None else read(results)
+        known = {} if results is None else read_checked(results)
         todo = [each for each in wanted if each not in known]
         divided = installs.divided(todo)
         here = divided.pop(sys.executable, [])
@@ -227,7 +227,7 @@ def command(
                 program = [python, "-P", "-m", "evopolicy_worker.cli", "check-env", "--results", str(kept)]
                 program += elsewhere
                 status = subprocess.run(program, stdout=subprocess.DEVNULL, check=False).returncode
-                known |= read(kept)
+                known |= read_checked(kept)
             if lost := [each for each in elsewhere if each not in known]:
                 raise WorkerError(f"{python} has ended with status {status} before {lost[0]}")
         shown = table(*COLUMNS)
@@ -239,7 +239,7 @@ def command(
         raise typer.Exit(any(known[each].verdict != "ok" for each in wanted))
 
 
-def read(results: Path) -> dict[str, Checked]:
+def read_checked(results: Path) -> dict[str, Checked]:
     """Results in the file, by environment id. Skips truncated lines, so that those environments are played again."""
     by_env: dict[str, Checked] = {}
     data = read_given(results, f"--results {results}") if results.exists() else b""

@@ -381,7 +381,7 @@ class Supervisor:
                     self._put_result(lease, "returned")
                     return healthy
                 playing = True
-                outcomes = await slot.play(job, folder, on_progress)
+                outcomes = await slot.play_job(job, folder, on_progress)
             self._warm_environments[job.env] = None
             if not outcomes:
                 self._put_result(lease, "returned", begun=slot.begun)

@@ -70,7 +70,7 @@ def read_steps(path: Path) -> list[LogStep]:
         # A run directory may be untrusted: a link would quote another file, and reading a pipe would block.
         with open_regular(path) as file:
             for line in file.read(MAX_LOG_BYTES).splitlines():
-                log.read(line)
+                log.read_line(line)
             if file.read(1):
                 log.step("system").texts.append(f"The log continues after {MAX_LOG_BYTES} bytes.")
     except OSError:
@@ -94,7 +94,7 @@ class _Log:
         self.steps.append(LogStep(source=source, key=key, at=at))
         return self.steps[-1]
 
-    def read(self, line: bytes) -> None:
+    def read_line(self, line: bytes) -> None:
         try:
             event = msgspec.json.decode(line)
         except DECODE_ERRORS:

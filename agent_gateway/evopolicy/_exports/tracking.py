@@ -60,7 +60,7 @@ class Curve(NamedTuple):
         return hashlib.sha256(f"{self.folder} {begun}".encode()).hexdigest()[:32]
 
     @property
-    def known(self) -> int:
+    def n_known(self) -> int:
         """As `Tracker.n_known`, once all of it was added."""
         return len(self.summaries) if self.record is None else -1
 
@@ -147,7 +147,7 @@ def _awaited(paths: list[Path]) -> bool:
 
 
 def _send(curve: Curve, tracker: Tracker) -> None:
-    if curve.known == 0 or (known := tracker.n_known(curve)) < 0:
+    if curve.n_known == 0 or (known := tracker.n_known(curve)) < 0:
         return
     seen, hidden = _points(curve)
     if points := seen[known:] + hidden:
@@ -235,7 +235,7 @@ class _Files:
     def _save_known(self, curve: Curve) -> None:
         path = self._known(curve)
         path.parent.mkdir(parents=True, exist_ok=True)
-        write_atomically(path, msgspec.json.encode(_Known(run=curve.id, submits=curve.known)))
+        write_atomically(path, msgspec.json.encode(_Known(run=curve.id, submits=curve.n_known)))
 
 
 class TensorBoard(_Files):
@@ -322,7 +322,7 @@ class MLflow:
         # A batch of the server holds at most 1,000 metrics.
         for first in range(0, len(metrics), 900):
             self._client.log_batch(run.info.run_id, metrics=metrics[first : first + 900])
-        tag = RunTag("evopolicy.submits", str(curve.known))
+        tag = RunTag("evopolicy.submits", str(curve.n_known))
         self._client.log_batch(run.info.run_id, params=params, tags=[tag])
         if curve.record is not None:
             self._client.set_terminated(run.info.run_id, "FINISHED" if curve.completed else "FAILED")

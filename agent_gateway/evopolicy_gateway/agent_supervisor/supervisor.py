@@ -69,7 +69,7 @@ async def keep(order: StartAgent, orders: Orders) -> AgentEnded:
         folders += [Path(order.jail.private, name) for name in ("home", "tmp")]
     # Binds this process to cores, or makes the agent's cgroup.
     resources = Resources(order.limits, folders, workspace / "feedback", jailed=order.jail is not None)
-    if words := resources.words():
+    if words := resources.limits_text():
         emit(messages.AgentDoing(note=f"agent limits: {words}"))
     activity = None if order.silence_s is None else Activity(order.silence_s, workspace)
     stage = Stage(
@@ -141,7 +141,7 @@ async def _play(
             kept = await asyncio.to_thread(
                 inputs.keep, config.skills, config.mcp, started_in, folder, order.inputs
             )
-        harness.take(kept)
+        harness.take_inputs(kept)
         stage.log.redact = stage.log.redact.knowing(own_config.secrets(harness.own_files))
         await asyncio.to_thread(own_config.copy, harness.own_files, Path(order.jail.private))
         jail = Jail(
@@ -166,7 +166,7 @@ async def _play(
     copied = own_config.secrets(harness.own_files) if order.jail is not None else ()
     kept_secret = [*written, *copied, *(stage.environment.get(name, "") for name in passed)]
     await asyncio.to_thread(note_passed, RunFolder(Path(order.folder)).passed, kept_secret)
-    return await harness.play(stage)
+    return await harness.run_agent(stage)
 
 
 def secrets_in(environment: Mapping[str, str], config: AgentConfig | None) -> dict[str, str]:
@@ -194,7 +194,7 @@ async def _stopped(orders: Orders, clock: AgentClock, activity: Activity | None)
     """Returns when the parent requests the stop or is gone; until then forwards its reports to the clocks."""
     while (order := await orders.next()) is not None:
         if isinstance(order, messages.SubmitsSeen):
-            clock.held(order.held_s)
+            clock.set_held(order.held_s)
             if activity is not None:
                 activity.note(order.asked, order.running)
         if isinstance(order, messages.StopAgent):

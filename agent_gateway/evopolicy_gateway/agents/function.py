@@ -90,7 +90,7 @@ def main() -> None:
     except ModuleNotFoundError as error:
         _fail(f"{error}: in the jail there are the standard library, numpy and the function's own code")
 
-    def play(client: Client) -> int:
+    def play_function(client: Client) -> int:
         workspace = Workspace(client, Path.cwd())
         value = function(workspace)
         try:
@@ -102,7 +102,7 @@ def main() -> None:
         (workspace.folder / RESULT).write_text(text, encoding="utf-8")
         return workspace.n_submits
 
-    exit_after("function", play)
+    exit_after("function", play_function)
 
 
 if __name__ == "__main__":

@@ -77,7 +77,7 @@ def _copy(source: Path, target: Path, left_out: Collection[str]) -> None:
             place.chmod(entry.stat().st_mode & 0o777)
 
 
-def play(client: Client, folder: Path, workspace: Path) -> int:
+def submit_all(client: Client, folder: Path, workspace: Path) -> int:
     """Submits all policies and returns the number of accepted submits. Raises ProtocolError if the gateway is
     unreachable."""
     info = client.info()
@@ -115,7 +115,7 @@ def _policy(folder: Path) -> list[Path]:
 
 def main() -> None:
     """Runs the agent in the current directory."""
-    exit_after("replay", lambda client: play(client, Path(sys.argv[1]), Path.cwd()))
+    exit_after("replay", lambda client: submit_all(client, Path(sys.argv[1]), Path.cwd()))
 
 
 if __name__ == "__main__":

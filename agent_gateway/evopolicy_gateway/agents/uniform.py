@@ -89,7 +89,7 @@ class Policy:
 '''
 
 
-def play(client: Client, workspace: Path) -> bool:
+def submit_random(client: Client, workspace: Path) -> bool:
     """Submits once and returns whether it was accepted. Raises ProtocolError when the gateway stays unreachable."""
     info = client.info()
     n_cases = int(info["env_meta"]["n_env_instances"])
@@ -105,7 +105,7 @@ def play(client: Client, workspace: Path) -> bool:
 
 def main() -> None:
     """Runs the agent in the current directory."""
-    exit_after("random", lambda client: play(client, Path.cwd()))
+    exit_after("random", lambda client: submit_random(client, Path.cwd()))
 
 
 if __name__ == "__main__":

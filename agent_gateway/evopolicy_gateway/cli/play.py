@@ -201,7 +201,7 @@ def replay(
         local = msgspec.structs.replace(where.local, policy_package=list(packages_for(run_directory, None)))
         where = msgspec.structs.replace(where, local=local)
     try:
-        run_to_end(plain_runs.play([plan], where, 1, terminal(stderr=True)))
+        run_to_end(plain_runs.play_plans([plan], where, 1, terminal(stderr=True)))
     except KeyboardInterrupt:
         fail("interrupted", 130)
     difference = recorded_agent.outcome(run_directory, plan)
@@ -238,7 +238,7 @@ def _play(plans: list[Plan], where: Cluster, parallel: int, as_json: bool, *, we
     where = msgspec.structs.replace(where, unjailed=_unjailed(plans), web=plans[0].runs if web else None)
     console = terminal(stderr=as_json)
     try:
-        played = run_to_end(plain_runs.play(plans, where, parallel, console))
+        played = run_to_end(plain_runs.play_plans(plans, where, parallel, console))
     except KeyboardInterrupt:
         fail("interrupted; runs whose agent was at work are cancelled and cannot be resumed", 130)
     if as_json:

@@ -93,7 +93,7 @@ def suite(
     if local and (connect or credentials_file):
         raise ConfigError("--local starts a cluster of its own; it cannot be combined with --connect")
     where = options.cluster_of(cluster, connect, credentials_file, local=local)
-    wanted = suite_file.read(file)
+    wanted = suite_file.read_suite(file)
     if parallel is not None:
         limits = msgspec.structs.replace(wanted.parallel, machine=parallel)
         wanted = msgspec.structs.replace(wanted, parallel=limits)
@@ -162,7 +162,7 @@ async def _suite(
                     if one.kind == "keep":
                         view.kept(one.run.name, index.runs.get(one.run.name))
                 sweep = ClaimedSweep(suite, root, index, operations, gateway, view)
-                await unless_failed(asyncio.create_task(sweep.play(decided)), failed)
+                await unless_failed(asyncio.create_task(sweep.play_runs(decided)), failed)
     entries = [entry for entry in map(index.runs.get, names) if entry and entry.state != "pending"]
     if not as_json:
         console.print(results_table(entries))

@@ -53,7 +53,7 @@ class CommandHarness(Harness):
         self._settings = settings or {}
         self._hint = hint
 
-    async def play(self, stage: Stage) -> AgentEnded:
+    async def run_agent(self, stage: Stage) -> AgentEnded:
         process = await stage.start(self._program, talks=True)
         talk = _Talk(process, stage)
         talking = asyncio.create_task(talk.go_on())
@@ -66,7 +66,7 @@ class CommandHarness(Harness):
             if talking.done() and not talk.stopped:
                 await asyncio.wait([ended, silent], return_when=asyncio.FIRST_COMPLETED)
             if silent.done() and not (ended.done() or talk.stopped):
-                facts, why = self.known(), silent.result()
+                facts, why = self.known_facts(), silent.result()
                 return AgentEnded(reason="silent", detail=why, turns=talk.turn, facts=facts)
             # The pipe may still hold the last lines; do not wait for a child that keeps it open.
             await asyncio.wait([talking], timeout=_PIPE_TIMEOUT_S)
@@ -78,11 +78,11 @@ class CommandHarness(Harness):
             await asyncio.gather(talking, silent, return_exceptions=True)
             await process.close()
 
-    def known(self) -> dict[str, Any]:
+    def known_facts(self) -> dict[str, Any]:
         return {"settings": self._settings | {"program": self._program}}
 
     def _ending(self, exit_code: int, turns: int) -> AgentEnded:
-        facts = self.known()
+        facts = self.known_facts()
         if exit_code == 0:
             return AgentEnded(reason="agent_stopped", turns=turns, facts=facts)
         how = f"exit status {exit_code}" if exit_code > 0 else f"signal {-exit_code}"
@@ -120,7 +120,7 @@ class RemoteHarness(Harness):
     name = "remote"
     resumable = True
 
-    async def play(self, stage: Stage) -> AgentEnded:
+    async def run_agent(self, stage: Stage) -> AgentEnded:
         finish = RunFolder(stage.workspace.parent).finish
         while not finish.exists() and not stage.over.is_set():
             await stage.sleep(_POLL_S)

@@ -68,7 +68,7 @@ class Content(NamedTuple):
     server: Server | None = None
 
 
-def read(skills: Sequence[str], servers: Mapping[str, McpServer], started_in: Path) -> list[Content]:
+def read_inputs(skills: Sequence[str], servers: Mapping[str, McpServer], started_in: Path) -> list[Content]:
     """All that is declared. Raises ConfigError that names the entry and its fault."""
     contents = [_skill(path, started_in) for path in skills]
     names = [each.recorded.name for each in contents]

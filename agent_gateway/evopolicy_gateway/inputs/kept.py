@@ -16,7 +16,7 @@ from evopolicy_common.errors import ConfigError
 from evopolicy_common.processes.scratch import remove_tree
 from evopolicy_common.records.blobs import write_atomically
 from evopolicy_common.records.run_record import AgentInput
-from evopolicy_gateway.inputs.declared import IN_JAIL, Content, McpServer, Server, read
+from evopolicy_gateway.inputs.declared import IN_JAIL, Content, McpServer, Server, read_inputs
 
 MCP_FILE = f"{IN_JAIL}/mcp.json"
 """The servers in the form that many CLIs read, `{"mcpServers": {…}}`."""
@@ -51,7 +51,7 @@ def keep(
     expected: Sequence[AgentInput],
 ) -> Kept:
     """The copies in `folder`, made if missing. ConfigError when the inputs differ from `expected`."""
-    declared = read(skills, servers, started_in)
+    declared = read_inputs(skills, servers, started_in)
     if changed := {(each.kind, each.name) for each in {each.recorded for each in declared} ^ set(expected)}:
         names = ", ".join(f"{kind} {name}" for kind, name in sorted(changed))
         raise ConfigError(

@@ -36,7 +36,7 @@ class AgentClock:
         self._paused_at: float | None = None
         self._held_s = 0.0
 
-    def held(self, seconds: float) -> None:
+    def set_held(self, seconds: float) -> None:
         """Sets the total seconds that its submits waited for hidden episodes, which do not count."""
         self._held_s = max(self._held_s, seconds)
 

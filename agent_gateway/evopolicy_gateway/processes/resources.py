@@ -68,7 +68,7 @@ class Resources:
             by["pids"] = "rlimit"
         self._now = AgentResources(limits=msgspec.structs.replace(asked, **values), kept_by=by)
 
-    def words(self) -> str:
+    def limits_text(self) -> str:
         """For the operator: the requested limits and the mechanism that keeps each; empty without any."""
         none = "no cgroup can be made here: unlimited"
         return ", ".join(

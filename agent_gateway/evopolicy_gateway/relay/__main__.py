@@ -46,7 +46,7 @@ async def tell(
         await sleep(_TELL_S)
         if used.requests != told:
             told = used.requests
-            say(used.words(prices))
+            say(used.use_text(prices))
 
 
 async def _main(fd: int) -> None:

@@ -118,7 +118,7 @@ class AnswerReader:
         self._model = self._tier = ""
 
     @property
-    def held(self) -> int:
+    def held_bytes(self) -> int:
         """Bytes of an event, or of a document, that is not whole yet."""
         return len(self._held)
 

@@ -106,7 +106,7 @@ class Used(msgspec.Struct, kw_only=True):
     """Sum over the answered requests, seconds."""
     wait_s: float = 0.0
 
-    def take(self, request: Request, declared: str | None = None) -> None:
+    def count_request(self, request: Request, declared: str | None = None) -> None:
         self.requests += 1
         self.usage += request.usage
         self.failed += not 200 <= request.status < 300 or request.broken
@@ -152,7 +152,7 @@ class Used(msgspec.Struct, kw_only=True):
         cost = {} if prices is None else {"cost": round(self.cost(prices), 6)}
         return self.usage.recorded(None) | cost
 
-    def words(self, prices: Prices | None) -> str:
+    def use_text(self, prices: Prices | None) -> str:
         """One line for people."""
         cost = "" if prices is None else f", {self.cost(prices):,.2f} dollars"
         failed = f" ({self.failed:,} failed)" if self.failed else ""
@@ -182,7 +182,7 @@ class Ledger:
 
     def write(self, request: Request) -> None:
         """Raises OSError when the disk refuses."""
-        self.used.take(request, self._declared)
+        self.used.count_request(request, self._declared)
         self._file.write(msgspec.json.encode(request) + b"\n")
 
 
@@ -192,5 +192,5 @@ def read_ledger(path: Path, declared: str | None = None) -> Used:
     with contextlib.suppress(OSError):
         for line in path.read_bytes().splitlines():
             with contextlib.suppress(*DECODE_ERRORS):
-                used.take(_decoder.decode(line), declared)
+                used.count_request(_decoder.decode(line), declared)
     return used

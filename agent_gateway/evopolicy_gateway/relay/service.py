@@ -113,7 +113,7 @@ class Relay:
         """Failed requests since the last answered one."""
         self._told: set[str] = set()
         keys = order.upstream.key, *order.upstream.headers.values()
-        self.clean = Redaction(keys).known
+        self.clean = Redaction(keys).without_known
         clean, folder = Cleaning(order.tokens, (*order.secrets, *keys)), Path(order.folder)
         self.provider: Source
         if order.replay:
@@ -393,7 +393,7 @@ class _Exchange:
             if relay.order.record != "off":
                 self._recorded = min(self._recorded + len(data), MAX_RECORDED_BYTES)
             passed = reader.feed(data)
-            self.hold(self._base + reader.held + len(passed))
+            self.hold(self._base + reader.held_bytes + len(passed))
             if reader.complete:
                 self._write()
             await self._put(relay.clean(passed))

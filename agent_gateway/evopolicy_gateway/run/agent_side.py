@@ -52,7 +52,7 @@ class AgentSide:
         """Whether the agent has begun, and the run's closing was not requested yet."""
         return self.agent.has_begun and not self._gateway.is_closing
 
-    async def play(self) -> None:
+    async def play_agent(self) -> None:
         """Plays until the run is closed; returns at once if it is. Raises EvopolicyError."""
         if self._gateway.closed:
             return

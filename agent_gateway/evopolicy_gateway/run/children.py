@@ -120,7 +120,7 @@ class GatewayProcess(Kept):
         run = self._run
         match event:
             case messages.Waits():
-                run.watch.held(run.plan.name, event.waits_for)
+                run.watch.run_held(run.plan.name, event.waits_for)
             case Ready():
                 run.stopwatch.held_reported(event.held_s, event.permit_s)
                 if not run.served.done():
@@ -179,7 +179,7 @@ class SupervisedAgent(Kept):
             if spent.is_set():
                 break
             self._run.note("the agent's supervisor died; starting it again, and the agent with it")
-        known = self._run.plan.harness().known()
+        known = self._run.plan.harness().known_facts()
         return AgentEnded(reason="agent_failed", detail="its agent supervisor died", facts=known)
 
     async def note_submits(self, submits: messages.SubmitsSeen) -> None:

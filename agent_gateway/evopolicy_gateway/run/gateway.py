@@ -190,6 +190,6 @@ def _load(folder: RunFolder) -> tuple[credentials.Credentials, OpenedRun]:
             f"{folder.root} holds no open run ({folder.state.name}/{folder.opened_run.name} is missing);"
             " runs are opened by `evopolicy run`"
         )
-    own = credentials.read(folder.credentials)
+    own = credentials.read_credentials(folder.credentials)
     credentials.check_endpoints(own)
     return own, saved(folder.opened_run, OpenedRun)

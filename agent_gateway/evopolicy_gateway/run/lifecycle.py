@@ -104,7 +104,7 @@ class RunLifecycle:
         """Whether the agent has begun, and the run's closing was not requested yet."""
         return self._side is not None and self._side.agent_at_work
 
-    async def play(self, put_aside: Callable[[], None] | None = None) -> RunRecord:
+    async def play_run(self, put_aside: Callable[[], None] | None = None) -> RunRecord:
         """Plays the run to `run.json`, also when this is cancelled, which cancels it. Raises EvopolicyError.
 
         `put_aside` moves the folder's earlier run away, which is deleted without it; a refused run leaves it.
@@ -204,7 +204,7 @@ class RunLifecycle:
         folder = self._folder
         if resumed := folder.opened_run.exists():
             self.run = saved(folder.opened_run, OpenedRun).run
-            token = credentials.read(folder.credentials).token
+            token = credentials.read_credentials(folder.credentials).token
         else:
             created = await self._operations.create(saved(folder.intended, IntendedRun))
             self.run, token = created.run, created.capability
@@ -240,7 +240,7 @@ class RunLifecycle:
 
     async def _agent(self) -> None:
         assert self._side is not None
-        await self._side.play()
+        await self._side.play_agent()
         if self._side.cancelled:
             await self._tell_gone()
         self._on_agent_gone()

@@ -65,7 +65,7 @@ def read_texts(
         workspace_prompts.check_text(str(path), text, PLACEHOLDERS)
     if prompts is not None:
         chosen = read_prompts(shipped.found(prompts, started_in))
-    declared = () if config is None else inputs.read(config.skills, config.mcp, started_in)
+    declared = () if config is None else inputs.read_inputs(config.skills, config.mcp, started_in)
     return Texts(agents_md=text, prompts=chosen, inputs=tuple(each.recorded for each in declared))
 
 
@@ -357,7 +357,7 @@ def find_start(text: str, started_in: Path) -> StartPoint:
         raise ConfigError(
             f"--start-from {text}: no run is there: {error.strerror}; name a run directory"
         ) from error
-    tree, digest = trees.read(folder.root, submit)
+    tree, digest = trees.read_tree(folder.root, submit)
     if not (folder.feedback / submit).is_dir():
         raise ConfigError(f"--start-from {text}: the submit has no feedback yet; wait until it is played")
     return StartPoint(Start(run=run, submit_index=number, tree=digest), folder, submit, tree)

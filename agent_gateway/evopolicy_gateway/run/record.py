@@ -215,11 +215,11 @@ def _complete(folder: RunFolder, plan: Plan, facts: dict[str, Any]) -> dict[str,
     except EvopolicyError:  # its file or its key has gone meanwhile
         return facts
     state = session.load(folder.session)
-    known = harness.known()
+    known = harness.known_facts()
     known["cli_version"] = state.cli_version
     known |= {name: value for name, value in facts.items() if value is not None}
     known |= {name: max(getattr(state, name), int(facts.get(name, 0))) for name in ("turns", "retries")}
-    known["settings"] = {**harness.known().get("settings", {}), **facts.get("settings", {})}
+    known["settings"] = {**harness.known_facts().get("settings", {}), **facts.get("settings", {})}
     if (terms := harness.model) is None:
         if state.used:  # a remote agent's own count, by model
             known["model_string"] = max(state.used, key=lambda model: state.used[model].total)
@@ -275,7 +275,7 @@ def _own_bundle(folder: RunFolder, digest: str | None) -> Bundle | None:
     """Reads the bundle from the gateway's store; None when it is missing there."""
     if digest is not None and folder.blobs.is_dir():
         with contextlib.suppress(StorageError):
-            return bundles.load(BlobStore(folder.blobs).read(digest), digest)
+            return bundles.load(BlobStore(folder.blobs).read_blob(digest), digest)
     return None
 
 

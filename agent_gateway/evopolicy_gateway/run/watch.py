@@ -19,7 +19,7 @@ from rich.text import Text
 
 from evopolicy_common.console import NarrowTable, Terminal
 from evopolicy_common.messages.operator import RunProgress
-from evopolicy_common.records.suite_folder import Entry
+from evopolicy_common.records.suite_folder import SweepRun
 from evopolicy_common.records.words import in_words
 from evopolicy_common.terminal import harmless
 from evopolicy_gateway.processes.child_messages import AgentDoing, Progress
@@ -48,7 +48,7 @@ class Row(msgspec.Struct):
     state: str = "waiting"
     """In a sweep: a state of its index, or `on HOST`; so are the next two."""
     tokens: dict[str, Any] | None = None
-    entry: Entry | None = None
+    entry: SweepRun | None = None
 
 
 class View(ABC):
@@ -79,7 +79,7 @@ class View(ABC):
     def render(self) -> RenderableType:
         """Returns the current table."""
 
-    def words(self, kind: str, run: str, details: dict[str, Any]) -> str:
+    def event_text(self, kind: str, run: str, details: dict[str, Any]) -> str:
         """The event's text for people; empty if it is not worth a line."""
         if kind == "phase":
             return PHASES[details["phase"]]
@@ -92,7 +92,7 @@ class View(ABC):
     def event(self, kind: str, run: str, **more: Any) -> None:
         if self._console is None or (self._drawn and kind not in self.above):
             return
-        if text := self.words(kind, run, more):
+        if text := self.event_text(kind, run, more):
             self._print(f"{run}: {text}" if run else text)
 
     # Reports of a run.
@@ -110,7 +110,7 @@ class View(ABC):
             self.event("submit", run, **known)
         self.waits_for(run, progress.waits_for)
 
-    def held(self, run: str, what: str) -> None:
+    def run_held(self, run: str, what: str) -> None:
         """The run may not start, or may not be closed, before `what`; empty: it may now."""
         self.row(run).held = what
         self.waits_for(run, what, "held")
@@ -159,7 +159,7 @@ class RunView(View):
 
     above = ("note", "held", "submit")
 
-    def words(self, kind: str, run: str, details: dict[str, Any]) -> str:
+    def event_text(self, kind: str, run: str, details: dict[str, Any]) -> str:
         if kind == "submit":
             progress = self.rows[run].progress
             assert progress is not None
@@ -168,7 +168,7 @@ class RunView(View):
             return f"{details['submit']} {in_words(details['status'])}{mean}; {left}"
         if kind == "paused":
             return f"{details['why']} (for {details['seconds']} s)"
-        return "" if details.get("phase") == "finished" else super().words(kind, run, details)
+        return "" if details.get("phase") == "finished" else super().event_text(kind, run, details)
 
     def render(self) -> Table:
         table = NarrowTable()

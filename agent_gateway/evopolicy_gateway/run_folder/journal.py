@@ -16,7 +16,7 @@ import msgspec
 
 from evopolicy_common.errors import DECODE_ERRORS, StorageError
 from evopolicy_common.records.blobs import fsync_directory
-from evopolicy_common.records.open_run import AnyEntry, entry_decoder
+from evopolicy_common.records.open_run import AnyLine, line_decoder
 
 
 class AtWork:
@@ -75,8 +75,8 @@ class Journal:
         self._path = path
         self.at_work = AtWork(path.with_name("at-work"))
         """The episodes whose files are being made."""
-        self.entries: dict[int, AnyEntry] = {}
-        """Its entries when it was opened, oldest first, by their file offsets for `read`."""
+        self.entries: dict[int, AnyLine] = {}
+        """Its entries when it was opened, oldest first, by their file offsets for `read_line`."""
         fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
         self._file = os.fdopen(fd, "r+b", buffering=0)
         try:
@@ -86,8 +86,8 @@ class Journal:
             self.close()
             raise
 
-    def append(self, entry: AnyEntry) -> int:
-        """Appends an entry durably; returns its file offset, for `read`. Raises StorageError, with nothing added.
+    def append(self, entry: AnyLine) -> int:
+        """Appends an entry durably; returns its file offset, for `read_line`. Raises StorageError, with nothing added.
 
         The entry is not kept in memory: a run has thousands of episodes, and each answer lists its own.
         """
@@ -100,10 +100,10 @@ class Journal:
             raise StorageError(f"cannot write {self._path}: {error.strerror or error}") from error
         return start
 
-    def read(self, place: int) -> AnyEntry:
+    def read_line(self, place: int) -> AnyLine:
         with self._path.open("rb") as file:
             file.seek(place)
-            entry: AnyEntry = entry_decoder.decode(file.readline())
+            entry: AnyLine = line_decoder.decode(file.readline())
             return entry
 
     def close(self) -> None:
@@ -116,7 +116,7 @@ class Journal:
         place = 0
         for number, line in enumerate(data[:whole].splitlines(keepends=True), start=1):
             try:
-                self.entries[place] = entry_decoder.decode(line)
+                self.entries[place] = line_decoder.decode(line)
                 place += len(line)
             except DECODE_ERRORS as error:
                 raise StorageError(f"{self._path}, line {number}, is damaged: {error}") from error

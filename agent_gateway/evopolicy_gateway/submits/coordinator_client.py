@@ -83,13 +83,13 @@ class CoordinatorClient:
     async def keep_permit(self, place: AgentPlace) -> None:
         """Renews the permit until cancelled, or until the coordinator accepts no more for this run."""
 
-        def lost(waits_for: str) -> None:
+        def permit_lost(waits_for: str) -> None:
             log.warning("the agent's permit has ended; asking for another", waits_for=waits_for)
 
         with contextlib.suppress(RefusedError):
             while True:
                 await asyncio.sleep(RENEWAL_S)
-                await self.permit(place, lost)
+                await self.permit(place, permit_lost)
 
     async def state(self) -> messages.RunState | None:
         """Returns the run's current state; None when the coordinator does not answer within a second, or has lost the

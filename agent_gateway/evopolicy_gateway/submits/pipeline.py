@@ -21,7 +21,7 @@ from evopolicy_common.errors import RefusedError, RequestError, StorageError
 from evopolicy_common.logs import structlog
 from evopolicy_common.messages.gateway import RunOpened, SubmitAccepted, SubmitDone
 from evopolicy_common.records.blobs import BlobStore
-from evopolicy_common.records.open_run import Accepted, AnyEntry, Died, Requested, Settled
+from evopolicy_common.records.open_run import Accepted, AnyLine, Died, Requested, Settled
 from evopolicy_common.records.policies.trees import Recorder
 from evopolicy_common.refusals import RUN_LOST, Refusal
 from evopolicy_gateway.run_folder.journal import Journal
@@ -91,7 +91,7 @@ class SubmitPipeline:
         if (earlier := self.machine.repeated(body, client_key)) is not None:
             return earlier
         try:
-            ticket = self.machine.ask(body, client_key, uuid.uuid4().hex)
+            ticket = self.machine.open_ticket(body, client_key, uuid.uuid4().hex)
         except RequestError as error:
             await self.note_rejected(error)
             raise
@@ -111,7 +111,7 @@ class SubmitPipeline:
         """The bytes of `summary.json`, from the journal: an agent may change the file. None: not settled."""
         if ticket.place is None:
             return None
-        entry = self._journal.read(ticket.place)
+        entry = self._journal.read_line(ticket.place)
         assert isinstance(entry, Settled)
         return entry.summary.encode()
 
@@ -175,7 +175,9 @@ class SubmitPipeline:
                 case TakeSnapshot():
                     given = self.folder.system, self._blobs
                     published = machine.run.profile != "own"
-                    snapshot = await self._on_disk(partial(snapshots.take, *given, published=published))
+                    snapshot = await self._on_disk(
+                        partial(snapshots.take_snapshot, *given, published=published)
+                    )
                     more = (ticket.submit_id, self._trees, self._blobs, self.folder.root)
                     return machine.snapshotted(
                         await asyncio.to_thread(snapshots.record_tree, snapshot, *more)
@@ -204,7 +206,7 @@ class SubmitPipeline:
             log.error("submit failed", submit=ticket.submit_id, exc_info=error)
             return machine.failed(error)
 
-    async def _note(self, entry: AnyEntry) -> int:
+    async def _note(self, entry: AnyLine) -> int:
         """Appends to the journal, in order; returns the offset."""
         async with self._journal_lock:
             return await self._on_disk(partial(self._journal.append, entry))
@@ -227,7 +229,7 @@ class SubmitPipeline:
         )
         for ticket in accepted[max(0, known - 1) :]:
             assert ticket.requested_at is not None
-            request = self._journal.read(ticket.requested_at)
+            request = self._journal.read_line(ticket.requested_at)
             assert isinstance(request, Requested)
             await self._send(request, ticket.index)
             await self._client.ended(ticket.index)
@@ -236,7 +238,7 @@ class SubmitPipeline:
         while True:
             known = request.bundle is None or request.bundle == self._uploaded
             if request.bundle is not None and not known:
-                data = await asyncio.to_thread(self._blobs.read, request.bundle)
+                data = await asyncio.to_thread(self._blobs.read_blob, request.bundle)
                 await self._client.upload(request.bundle, data)
             try:
                 reply = await self._client.submit(request, index)

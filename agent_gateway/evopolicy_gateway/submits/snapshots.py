@@ -33,7 +33,7 @@ class Snapshot(msgspec.Struct, frozen=True, kw_only=True):
     """Digest of the workspace's tree; empty: not recorded."""
 
 
-def take(system: Path, blobs: BlobStore, *, published: bool = False) -> Snapshot:
+def take_snapshot(system: Path, blobs: BlobStore, *, published: bool = False) -> Snapshot:
     """Snapshots the current `system` and stores the bundle.
 
     A folder that cannot be a bundle is the policy's failure and is charged: `missing_policy` when `policy.py` is
@@ -62,7 +62,7 @@ def record_tree(
     """The snapshot with the workspace's tree, unless that cannot be recorded. `folder`: the run's."""
     digest = snapshot.digest or snapshot.kept
     try:
-        bundle = None if digest is None else bundles.load(blobs.read(digest), digest)
+        bundle = None if digest is None else bundles.load(blobs.read_blob(digest), digest)
         tree = recorder.record(submit, bundle, read_passed(folder))
     except Exception as error:
         log.error("the workspace is not recorded", submit=submit, exc_info=error)

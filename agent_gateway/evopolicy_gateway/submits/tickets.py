@@ -1,8 +1,8 @@
 """The submits of one run as a pure machine: outcomes in, next effect out. No clock, disk, network or await.
 
-    machine = TicketMachine(run, entries)         # the journal's: the state that the last gateway left
-    ticket = machine.ask(body, client_key, key)   # raises RequestError
-    effect = machine.next()                       # for the ticket in flight: a new one, or the last gateway's
+    machine = TicketMachine(run, entries)                # the journal's: the state that the last gateway left
+    ticket = machine.open_ticket(body, client_key, key)  # raises RequestError
+    effect = machine.next()                              # for the ticket in flight: a new one, or the last gateway's
 
 The pipeline performs one effect at a time and passes its outcome to the method that returns the next effect:
 
@@ -31,7 +31,7 @@ from evopolicy_common.messages import gateway as messages
 from evopolicy_common.messages.gateway import CANCELLED, RunOpened, RunState
 from evopolicy_common.records import open_run
 from evopolicy_common.records.blobs import digest_of
-from evopolicy_common.records.open_run import AnyEntry, Requested
+from evopolicy_common.records.open_run import AnyLine, Requested
 from evopolicy_common.refusals import RUN_OVER, Refusal
 from evopolicy_gateway.run_folder.layout import submit_id
 from evopolicy_gateway.submits.snapshots import Snapshot
@@ -115,7 +115,7 @@ class Collect(msgspec.Struct, frozen=True):
 class Note(msgspec.Struct, frozen=True):
     """Append an entry to the journal."""
 
-    entry: AnyEntry
+    entry: AnyLine
 
 
 class Stop(msgspec.Struct, frozen=True):
@@ -130,7 +130,7 @@ Effect = TakeSnapshot | Send | Collect | Note | Stop
 class TicketMachine:
     """All submits of one run, of which at most one is in flight."""
 
-    def __init__(self, run: RunOpened, entries: Mapping[int, AnyEntry] | None = None) -> None:
+    def __init__(self, run: RunOpened, entries: Mapping[int, AnyLine] | None = None) -> None:
         """`entries`: as in `Journal`."""
         self.run = run
         self.state: RunState = run.state
@@ -194,7 +194,7 @@ class TicketMachine:
             raise ConflictError(ticket.index, why)
         return ticket
 
-    def ask(self, body: bytes, client_key: str | None, key: str) -> Ticket:
+    def open_ticket(self, body: bytes, client_key: str | None, key: str) -> Ticket:
         """Puts a request in flight under the new `key`. Raises RequestError: refused, nothing is charged."""
         if self.in_flight is not None:
             index, name = self.in_flight.index, self.in_flight.submit_id
@@ -287,7 +287,7 @@ class TicketMachine:
         self._failure = error
         return Note(open_run.Died(key=self._open.request.key))
 
-    def noted(self, entry: AnyEntry, place: int) -> Effect | None:
+    def noted(self, entry: AnyLine, place: int) -> Effect | None:
         """The entry is durable at that offset of the journal; returns the next effect."""
         match entry:
             case Requested():

@@ -33,7 +33,7 @@ from evopolicy_common.processes.scratch import remove_tree
 from evopolicy_common.records.blobs import write_atomically
 from evopolicy_common.records.open_run import OpenedRun
 from evopolicy_common.records.run_files import read_record
-from evopolicy_common.records.suite_folder import FINISHED, INDEX, PAUSED, Entry, Index
+from evopolicy_common.records.suite_folder import FINISHED, INDEX, PAUSED, Index, SweepRun
 from evopolicy_gateway.harnesses.coding_agents import session
 from evopolicy_gateway.processes.child_messages import AgentDoing
 from evopolicy_gateway.run.operations import Operations
@@ -76,13 +76,13 @@ class ClaimedSweep(Sweep):
         """The coordinator's process, as its last reply named it, and the one that was told all results of this host."""
         self._view.on_doing = self._on_doing
 
-    async def play(self, decisions: Sequence[Decision]) -> None:
+    async def play_runs(self, decisions: Sequence[Decision]) -> None:
         self._decided = {one.run.name: one for one in decisions}
         await self._tell_results()
         renewing = asyncio.create_task(self._renew())
         try:
             # Unrenewed claims would pass to another host while their runs continue here.
-            await unless_failed(asyncio.create_task(super().play(decisions)), renewing)
+            await unless_failed(asyncio.create_task(super().play_runs(decisions)), renewing)
         finally:
             renewing.cancel()
             await asyncio.gather(renewing, return_exceptions=True)
@@ -135,7 +135,7 @@ class ClaimedSweep(Sweep):
         run = decision.run
         claim = await self._ask(run)
         if claim.result is not None:
-            entry = msgspec.convert(claim.result | {"directory": ""}, Entry)
+            entry = msgspec.convert(claim.result | {"directory": ""}, SweepRun)
             self._put(entry)
             self._view.finished(run.name, entry)
             return True
@@ -159,7 +159,7 @@ class ClaimedSweep(Sweep):
             decision = self._anew(run.name)
         return await super()._begin(decision)
 
-    def _begun(self, decision: Decision) -> Entry:
+    def _begun(self, decision: Decision) -> SweepRun:
         settings = msgspec.to_builtins(decision.run.defining)
         used = self._used_before(decision)
         return msgspec.structs.replace(super()._begun(decision), host=self._host, settings=settings, **used)
@@ -171,7 +171,7 @@ class ClaimedSweep(Sweep):
         result = msgspec.to_builtins(entry) if entry.state in FINISHED else None
         await self._ask(decision.run, None if result else 0.0, result)
 
-    async def _record(self, decision: Decision, begun: Entry) -> Entry:
+    async def _record(self, decision: Decision, begun: SweepRun) -> SweepRun:
         run = decision.run
         if decision.kind == "finish":
             await self._check_held(run, "another host has it now: its files are not written here")
@@ -305,7 +305,7 @@ class ClaimedSweep(Sweep):
                 return form.format(used, most)
         return None
 
-    def _put(self, entry: Entry) -> None:
+    def _put(self, entry: SweepRun) -> None:
         super()._put(entry)
         self._save()
 

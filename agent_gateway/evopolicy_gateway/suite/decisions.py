@@ -19,7 +19,7 @@ import msgspec
 
 from evopolicy_common import catalogue
 from evopolicy_common.errors import ConfigError
-from evopolicy_common.records.suite_folder import FINISHED, Entry
+from evopolicy_common.records.suite_folder import FINISHED, SweepRun
 from evopolicy_gateway.run.plan import Plan
 
 Kind = Literal["keep", "new", "resume", "finish", "restart"]
@@ -38,7 +38,7 @@ _WORDS: dict[Kind, str] = {
 class Facts(msgspec.Struct, frozen=True, kw_only=True):
     """The known facts about a run."""
 
-    entry: Entry | None = None
+    entry: SweepRun | None = None
     """Its entry in the index."""
     status: str | None = None
     """The status in its `run.json`."""

@@ -13,7 +13,7 @@ from evopolicy_common.console import Terminal, table
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.local.cluster import unless_failed
 from evopolicy_common.records.run_record import Outcome, RunRecord
-from evopolicy_common.records.suite_folder import Entry, Index
+from evopolicy_common.records.suite_folder import Index, SweepRun
 from evopolicy_common.records.words import in_words
 from evopolicy_common.terminal import number
 from evopolicy_gateway.operator.cluster import Cluster, connected
@@ -46,7 +46,7 @@ class _Runs(Sweep):
         self.leaves = leaves
         self._results = played
 
-    async def _record(self, decision: Decision, begun: Entry) -> Entry:
+    async def _record(self, decision: Decision, begun: SweepRun) -> SweepRun:
         run = decision.run
         record = self._results.records[run.name] = await self._played(decision, run)
         # Unlike a suite, this never repeats a run whose agent did not play, so the run keeps its own status.
@@ -62,7 +62,7 @@ class _Runs(Sweep):
         return why
 
 
-async def play(plans: Sequence[Plan], where: Cluster, parallel: int, console: Terminal) -> PlayedRuns:
+async def play_plans(plans: Sequence[Plan], where: Cluster, parallel: int, console: Terminal) -> PlayedRuns:
     """Plays all plans, `parallel` agents at once; a failed run does not stop the others.
 
     Raises ConfigError when an option is wrong for every run.
@@ -77,7 +77,7 @@ async def play(plans: Sequence[Plan], where: Cluster, parallel: int, console: Te
             # A temporary cluster takes its runs with it.
             leaves: Leaves = "nothing" if where.local is not None and where.local.state is None else "ended"
             runs = _Runs(played, parallel, leaves, operations, gateway, watch)
-            await unless_failed(asyncio.create_task(runs.play(decided)), failed)
+            await unless_failed(asyncio.create_task(runs.play_runs(decided)), failed)
     if played.wrong == set(played.index.runs):
         raise ConfigError(played.index.runs[plans[0].name].error or "")
     return played

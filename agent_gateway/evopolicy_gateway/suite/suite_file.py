@@ -119,7 +119,7 @@ def _found(name: str) -> bytes:
     raise ConfigError(f"no file and no shipped suite named {name!r}; shipped are {', '.join(there)}")
 
 
-def read(name: str) -> SuiteFile:
+def read_suite(name: str) -> SuiteFile:
     """Reads and validates a suite's file. Raises ConfigError with the problem and its place."""
     data = _found(name)
     try:

@@ -16,7 +16,7 @@ import msgspec
 from evopolicy_common.errors import DECODE_ERRORS, ConfigError
 from evopolicy_common.records.blobs import write_atomically
 from evopolicy_common.records.run_record import RunRecord
-from evopolicy_common.records.suite_folder import INDEX, SCHEMA_VERSION, Entry, Index, State
+from evopolicy_common.records.suite_folder import INDEX, SCHEMA_VERSION, Index, State, SweepRun
 from evopolicy_common.records.summary import utc_text
 from evopolicy_common.terminal import say_lines
 from evopolicy_gateway.relay.usage import tokens_in
@@ -61,7 +61,7 @@ def directory_of(run: Plan) -> str:
     return str(run.folder.root.relative_to(run.runs.absolute()))
 
 
-def entry_of(plan: Plan, record: RunRecord, **more: Any) -> Entry:
+def entry_of(plan: Plan, record: RunRecord, **more: Any) -> SweepRun:
     outcome, state, tokens = record.outcome, state_of(record), record.agent.tokens
     use = record.agent.model_use
     requests = {"requests": 0 if use is None else use.requests or 0}
@@ -83,9 +83,9 @@ def entry_of(plan: Plan, record: RunRecord, **more: Any) -> Entry:
     )
 
 
-def waiting(plan: Plan) -> Entry:
+def waiting(plan: Plan) -> SweepRun:
     env, repeat = plan.settings.env, plan.settings.repeat
-    return Entry(name=plan.name, agent=plan.entry, env=env, repeat=repeat, digest=plan.digest)
+    return SweepRun(name=plan.name, agent=plan.entry, env=env, repeat=repeat, digest=plan.digest)
 
 
 def used(index: Index) -> tuple[int, float, int]:
@@ -121,7 +121,7 @@ def exit_code(runs: Sequence[Plan], index: Index) -> int:
     return next((code for kind, code in EXIT_CODES.items() if kind in kinds), 0)
 
 
-def _kind(entry: Entry | None) -> str:
+def _kind(entry: SweepRun | None) -> str:
     """A key of `EXIT_CODES`, or `completed`."""
     if entry is None:
         return "error"
@@ -130,7 +130,7 @@ def _kind(entry: Entry | None) -> str:
     return entry.state if entry.state in EXIT_CODES or entry.state == "completed" else "error"
 
 
-def _why(run: Plan, entry: Entry | None) -> str:
+def _why(run: Plan, entry: SweepRun | None) -> str:
     if entry is None or entry.state == "pending":
         return f"{run.name}: it was not begun"
     reasons = {

@@ -16,7 +16,7 @@ from rich.text import Text
 
 from evopolicy_common.console import Terminal, table
 from evopolicy_common.messages.gateway import FREE_SLOT
-from evopolicy_common.records.suite_folder import FINISHED, Entry
+from evopolicy_common.records.suite_folder import FINISHED, SweepRun
 from evopolicy_common.records.words import in_words
 from evopolicy_common.terminal import number, say_json
 from evopolicy_gateway.processes.child_messages import AgentDoing
@@ -49,7 +49,7 @@ class SuiteView(View):
 
     # Reports of the sweep.
 
-    def kept(self, name: str, entry: Entry | None) -> None:
+    def kept(self, name: str, entry: SweepRun | None) -> None:
         """The run is finished already."""
         row = self.rows[name]
         row.state, row.entry = "completed" if entry is None else entry.state, entry
@@ -59,7 +59,7 @@ class SuiteView(View):
         self.rows[name].state = "running"
         self.event("started", name, attempt=attempt)
 
-    def finished(self, name: str, entry: Entry) -> None:
+    def finished(self, name: str, entry: SweepRun) -> None:
         row = self.rows[name]
         row.state, row.entry, row.action = entry.state, entry, ""
         row.tokens = entry.tokens or row.tokens
@@ -81,7 +81,7 @@ class SuiteView(View):
 
     # Reports of a run.
 
-    def held(self, run: str, what: str) -> None:
+    def run_held(self, run: str, what: str) -> None:
         self.waits_for(run, what)
 
     def doing(self, run: str, doing: AgentDoing) -> None:
@@ -119,7 +119,7 @@ class SuiteView(View):
             return None
         return sum(walls) / len(walls) * n_open / min(self._parallel, n_open)
 
-    def words(self, kind: str, run: str, details: dict[str, Any]) -> str:
+    def event_text(self, kind: str, run: str, details: dict[str, Any]) -> str:
         if kind == "started":
             return "begins" + (f", attempt {details['attempt']}" if details["attempt"] > 1 else "")
         if kind == "finished":
@@ -137,7 +137,7 @@ class SuiteView(View):
             return f"{details['provider']} is away, waits {details['seconds']} s ({details['why']})"
         if kind == "elsewhere":
             return f"is played on {details['host']}"
-        return "" if details.get("phase") in ("open", "finished") else super().words(kind, run, details)
+        return "" if details.get("phase") in ("open", "finished") else super().event_text(kind, run, details)
 
     def render(self) -> Group:
         """The table as it is now."""
@@ -170,7 +170,7 @@ class JsonView(SuiteView):
         say_json(document, indent=False)
 
 
-def results_table(entries: list[Entry]) -> Table:
+def results_table(entries: list[SweepRun]) -> Table:
     headings = ("run", "state", "score", "random", "budget used", "tokens")
     made = table(*headings, right=("score", "random", "tokens"))
     for entry in entries:

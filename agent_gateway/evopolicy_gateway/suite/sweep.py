@@ -15,7 +15,7 @@ from functools import partial
 import msgspec
 
 from evopolicy_common.records.run_record import RunRecord
-from evopolicy_common.records.suite_folder import Entry, Index
+from evopolicy_common.records.suite_folder import Index, SweepRun
 from evopolicy_common.wire.credentials import Credentials
 from evopolicy_gateway.run.lifecycle import Leaves, RunLifecycle
 from evopolicy_gateway.run.operations import Operations
@@ -55,7 +55,7 @@ class Sweep(ABC):
         self._moved = asyncio.Event()
         """Set when an agent is gone."""
 
-    async def play(self, decisions: Sequence[Decision]) -> None:
+    async def play_runs(self, decisions: Sequence[Decision]) -> None:
         """Plays all runs to their end, or as far as caps and other hosts' runs allow."""
         self._todo = [one for one in decisions if one.kind != "keep"]
         self._decided = {one.run.name: one for one in decisions}
@@ -85,7 +85,7 @@ class Sweep(ABC):
     # Overridden by the kinds of sweep.
 
     @abstractmethod
-    async def _record(self, decision: Decision, begun: Entry) -> Entry:
+    async def _record(self, decision: Decision, begun: SweepRun) -> SweepRun:
         """Plays a run and returns its resulting entry."""
 
     def _given_up(self) -> bool:
@@ -105,10 +105,10 @@ class Sweep(ABC):
         """Handles the end of a run here; raises unexpected errors."""
         task.result()
 
-    def _put(self, entry: Entry) -> None:
+    def _put(self, entry: SweepRun) -> None:
         self._index.runs[entry.name] = entry
 
-    def _begun(self, decision: Decision) -> Entry:
+    def _begun(self, decision: Decision) -> SweepRun:
         run, now = decision.run, {"state": "running", "attempt": decision.attempt}
         return msgspec.structs.replace(waiting(run), **now, directory=directory_of(run))
 
@@ -160,7 +160,7 @@ class Sweep(ABC):
         before, begun = self._index.runs.get(decision.run.name), self._begun(decision)
         self._put(begun)
         pauses = list(FINISH_AGAIN_S)
-        done: Entry | None = None
+        done: SweepRun | None = None
         while done is None:
             try:
                 done = await self._record(decision, begun)
@@ -187,4 +187,4 @@ class Sweep(ABC):
         gone = partial(self._agent_gone, plan.name)
         play = RunLifecycle(*known, leaves=self.leaves, on_agent_gone=gone)
         self._plays[plan.name] = play
-        return await (play.go_on() if decision.kind in ("resume", "finish") else play.play(put_aside))
+        return await (play.go_on() if decision.kind in ("resume", "finish") else play.play_run(put_aside))

@@ -209,7 +209,7 @@ def source_of(env_id: str) -> str:
     return _added[env_id][1] if env_id in _added else env_id
 
 
-def known(env_id: str) -> Entry | None:
+def known_entry(env_id: str) -> Entry | None:
     """The entry of an environment, without asking a worker; None if it is unknown here."""
     if env_id in _load().entries:
         return _load().entries[env_id]
@@ -231,7 +231,7 @@ def is_foreign(env_id: str) -> bool:
 
 def entry(env_id: str) -> Entry:
     """The entry of `env_id`, with its id alone if foreign. Raises ConfigError with similar names."""
-    if row := known(env_id) or (Entry(id=env_id) if is_foreign(env_id) else None):
+    if row := known_entry(env_id) or (Entry(id=env_id) if is_foreign(env_id) else None):
         return row
     raise ConfigError(f"no environment {env_id!r} in the catalogue{near(env_id)}")
 

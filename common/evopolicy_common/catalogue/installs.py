@@ -82,7 +82,7 @@ def installs() -> dict[str, Install]:
 
 def family_of(env_id: str) -> str:
     """The family, a key of `installs()`, that must be installed to play an environment; empty when nothing must."""
-    entry = catalogue.known(env_id)
+    entry = catalogue.known_entry(env_id)
     adapter = "" if entry is None else entry.adapter
     return next((name for name, each in installs().items() if adapter in (each.adapters or (name,))), "")
 
@@ -102,7 +102,7 @@ def is_here(family: str) -> bool:
 def own() -> str:
     """This interpreter's installation as `NAME@DIGEST`: the families for which `setup` made it, joined with `+`, or
     else `base`; and 12 hex digits of the SHA-256 of the names and versions of all packages in it. Tells no path."""
-    here = read(Path(sys.prefix))
+    here = read_made(Path(sys.prefix))
     names = {
         each.name.removesuffix(".dist-info")
         # Unlike `Path.is_dir`, this raises nothing for a folder of PYTHONPATH that may not be looked at.
@@ -132,7 +132,7 @@ def root() -> Path:
     return Path(data, "evopolicy", "installs")
 
 
-def read(folder: Path) -> Made | None:
+def read_made(folder: Path) -> Made | None:
     """The description of a virtual environment; None when the folder is none that `setup` made."""
     try:
         made = msgspec.json.decode((folder / MARK).read_bytes(), type=Made)
@@ -147,7 +147,7 @@ def made() -> list[Made]:
         folders = list(root().iterdir())
     except OSError:
         return []
-    ready = [made for each in folders if (made := read(each)) is not None and made.ready]
+    ready = [made for each in folders if (made := read_made(each)) is not None and made.ready]
 
     def finished_at(made: Made) -> float:
         with contextlib.suppress(OSError):

@@ -141,7 +141,7 @@ class BlobStore:
             write_atomically(path, data, durable=durable)
         return digest
 
-    def read(self, digest: str) -> bytes:
+    def read_blob(self, digest: str) -> bytes:
         """The blob's bytes, checked. Raises StorageError when it is missing or damaged (a damaged file is renamed)."""
         path = self.path(digest)
         try:

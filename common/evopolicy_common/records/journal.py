@@ -74,7 +74,7 @@ class Revealed(msgspec.Struct, frozen=True, kw_only=True, tag="revealed", tag_fi
     at: Number
 
 
-Entry = Opened | Ended | Revealed
+EpochEntry = Opened | Ended | Revealed
 
 
 class Opening(msgspec.Struct, frozen=True, kw_only=True):
@@ -100,15 +100,15 @@ class Opening(msgspec.Struct, frozen=True, kw_only=True):
     """SHA-256 (hex) of the secret from which the policies' random seeds derive."""
 
 
-def document(content: Entry | Opening | RunResult) -> bytes:
+def document(content: EpochEntry | Opening | RunResult) -> bytes:
     """The bytes of a document or entry, as they are hashed and stored."""
     return msgspec.json.encode(content, order="sorted")
 
 
-_entries: msgspec.json.Decoder[Entry] = msgspec.json.Decoder(Entry)
+_entries: msgspec.json.Decoder[EpochEntry] = msgspec.json.Decoder(EpochEntry)
 
 
-def read_entry(data: bytes) -> Entry:
+def read_entry(data: bytes) -> EpochEntry:
     """Decodes an entry. Raises ProtocolError for bytes that this version does not know as an entry."""
     try:
         return _entries.decode(data)
@@ -152,7 +152,7 @@ class Epoch(msgspec.Struct, frozen=True, kw_only=True):
     """Time at which its cases became public, Unix time, seconds; None while they are secret."""
 
 
-def epochs(entries: Iterable[Entry]) -> tuple[Epoch, ...]:
+def epochs(entries: Iterable[EpochEntry]) -> tuple[Epoch, ...]:
     """The epochs in a journal, in the order of their first runs."""
     runs: dict[str, str] = {}
     began: dict[str, float] = {}

@@ -23,7 +23,7 @@ LISTENER = f"{STATE}/door.json"
 UNWATCHED = f"{STATE}/unwatched"
 """There for an agent that was started by hand."""
 JOURNAL = f"{STATE}/journal.jsonl"
-"""One `AnyEntry` a line."""
+"""One `AnyLine` a line."""
 BUNDLES = f"{STATE}/bundles"
 
 
@@ -61,11 +61,11 @@ class IntendedRun(msgspec.Struct, frozen=True, kw_only=True):
     """As in `CreateRun`."""
 
 
-class Entry(msgspec.Struct, frozen=True, kw_only=True, tag_field="what"):
+class JournalLine(msgspec.Struct, frozen=True, kw_only=True, tag_field="what"):
     """A line of the journal."""
 
 
-class Requested(Entry, frozen=True, kw_only=True, tag="requested"):
+class Requested(JournalLine, frozen=True, kw_only=True, tag="requested"):
     """A submit that passed the checks; written before anything of it is sent."""
 
     key: str
@@ -84,7 +84,7 @@ class Requested(Entry, frozen=True, kw_only=True, tag="requested"):
     """Digest of the workspace's tree (`records/policies/trees`); empty: not recorded."""
 
 
-class Accepted(Entry, frozen=True, kw_only=True, tag="accepted"):
+class Accepted(JournalLine, frozen=True, kw_only=True, tag="accepted"):
     """The coordinator has accepted it: durable and charged."""
 
     key: str
@@ -93,7 +93,7 @@ class Accepted(Entry, frozen=True, kw_only=True, tag="accepted"):
     remaining_budget: int
 
 
-class Settled(Entry, frozen=True, kw_only=True, tag="settled"):
+class Settled(JournalLine, frozen=True, kw_only=True, tag="settled"):
     """Its feedback is committed."""
 
     key: str
@@ -102,7 +102,7 @@ class Settled(Entry, frozen=True, kw_only=True, tag="settled"):
     """The text of `summary.json`, byte for byte."""
 
 
-class Refused(Entry, frozen=True, kw_only=True, tag="refused"):
+class Refused(JournalLine, frozen=True, kw_only=True, tag="refused"):
     """The coordinator refused it; nothing was charged."""
 
     key: str
@@ -110,7 +110,7 @@ class Refused(Entry, frozen=True, kw_only=True, tag="refused"):
     message: str
 
 
-class Rejected(Entry, frozen=True, kw_only=True, tag="rejected"):
+class Rejected(JournalLine, frozen=True, kw_only=True, tag="rejected"):
     """A request with an invalid form or outside the bounds, refused here before the snapshot."""
 
     status: str
@@ -121,7 +121,7 @@ class Rejected(Entry, frozen=True, kw_only=True, tag="rejected"):
     """Number of submits accepted before it."""
 
 
-class Died(Entry, frozen=True, kw_only=True, tag="died"):
+class Died(JournalLine, frozen=True, kw_only=True, tag="died"):
     """A gateway died while it worked on a submit, or on the feedback of some of its episodes."""
 
     key: str
@@ -129,12 +129,12 @@ class Died(Entry, frozen=True, kw_only=True, tag="died"):
     """Request indices of these episodes; empty: the submit as a whole."""
 
 
-class SetAside(Entry, frozen=True, kw_only=True, tag="set_aside"):
+class SetAside(JournalLine, frozen=True, kw_only=True, tag="set_aside"):
     """A submit on which the gateway failed twice: it has no feedback and is not retried."""
 
     key: str
     message: str
 
 
-AnyEntry = Requested | Accepted | Settled | Refused | Rejected | Died | SetAside
-entry_decoder = msgspec.json.Decoder(AnyEntry)
+AnyLine = Requested | Accepted | Settled | Refused | Rejected | Died | SetAside
+line_decoder = msgspec.json.Decoder(AnyLine)

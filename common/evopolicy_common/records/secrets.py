@@ -139,9 +139,9 @@ class Redaction:
 
     def __call__(self, line: bytes) -> bytes:
         """Returns the line without secrets. A JSON line stays valid JSON."""
-        return redacted(self.known(line))
+        return redacted(self.without_known(line))
 
-    def known(self, line: bytes) -> bytes:
+    def without_known(self, line: bytes) -> bytes:
         """Returns the line without the known secrets, also where JSON spells some of their characters as `\\u002d`."""
         if self._known is None:
             return line

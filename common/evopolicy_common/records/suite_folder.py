@@ -20,7 +20,7 @@ State = Literal["pending", "running"] | RunEnd
 FINISHED: frozenset[str] = frozenset({"completed", "no_ok_submit"})
 
 
-class Entry(msgspec.Struct, frozen=True, kw_only=True):
+class SweepRun(msgspec.Struct, frozen=True, kw_only=True):
     """One run."""
 
     name: str
@@ -56,4 +56,4 @@ class Index(msgspec.Struct, kw_only=True):
     schema_version: int = SCHEMA_VERSION
     suite: str
     updated_at: str = ""
-    runs: dict[str, Entry] = {}
+    runs: dict[str, SweepRun] = {}

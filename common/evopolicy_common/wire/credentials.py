@@ -82,7 +82,7 @@ def write(credentials: Credentials, path: Path) -> None:
     write_atomically(path, msgspec.json.format(msgspec.json.encode(credentials)), mode=0o600)
 
 
-def read(path: Path) -> Credentials:
+def read_credentials(path: Path) -> Credentials:
     """The credentials in `path`, with absolute paths. Raises ConfigError if missing, malformed or not
     private."""
     data = _read_private(path)
@@ -192,7 +192,7 @@ def find(role: Role, connect: tuple[str, ...] = (), file: Path | None = None) ->
                 f"no {role} credentials{where}: looked at {file}. Start evopolicy-coordinator on this machine, or name"
                 f" a folder that `evopolicy-coordinator certs issue {role} NAME` wrote with --credentials{local}"
             )
-    own = read(file)
+    own = read_credentials(file)
     if own.role != role:
         raise ConfigError(f"{file} holds credentials of role {own.role!r}; this command needs {role!r}")
     return at(own, connect)

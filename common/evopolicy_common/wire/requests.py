@@ -57,7 +57,7 @@ class Requester(Generic[Reply]):
         TransportError without a reply, ProtocolError for another reply.
         """
         with notify_if_slow("the coordinator to answer", wait_s + AFTER_S):
-            answer = await self._link.ask(self._key_of(verb), codec.encode(message), wait_s + ANSWER_S)
+            answer = await self._link.query(self._key_of(verb), codec.encode(message), wait_s + ANSWER_S)
         return expect(codec.decode(self._replies, answer), wanted)
 
     async def until_answered(

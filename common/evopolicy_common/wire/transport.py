@@ -155,7 +155,7 @@ class Link:
         """Whether a router is connected now; a hint for messages to people."""
         return bool(self._session.info.routers_zid())
 
-    async def ask(self, key: str, payload: bytes, timeout_s: float) -> bytes:
+    async def query(self, key: str, payload: bytes, timeout_s: float) -> bytes:
         """Sends one query and returns its reply.
 
         Raises TransportError when none came within `timeout_s` seconds, or at once when nobody serves that key or the
@@ -200,7 +200,7 @@ class Link:
         return answer
 
     def ask_blocking(self, key: str, payload: bytes, timeout_s: float) -> bytes:
-        """`ask` for a dedicated thread, such as the heartbeat's."""
+        """`query` for a dedicated thread, such as the heartbeat's."""
         try:
             replies = self._session.get(
                 key, payload=payload, timeout=timeout_s, congestion_control=zenoh.CongestionControl.BLOCK

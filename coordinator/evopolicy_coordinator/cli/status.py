@@ -34,11 +34,11 @@ runs_app = App(name="runs", help="Cancel and repin runs.", no_args_is_help=True)
 
 
 def asking(connect: list[str] | None, file: Path | None, work: Callable[[OperatorClient], Awaitable[T]]) -> T:
-    async def ask() -> T:
+    async def ask_cluster() -> T:
         async with transport.connect(credentials.find_running(tuple(connect or ()), file)) as link:
             return await work(OperatorClient(link))
 
-    return asyncio.run(ask())
+    return asyncio.run(ask_cluster())
 
 
 @status_app.callback(

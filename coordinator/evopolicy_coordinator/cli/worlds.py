@@ -35,7 +35,7 @@ from evopolicy_common.wire import credentials, transport
 from evopolicy_common.worlds.rules import PARAMETERS, Rules
 from evopolicy_common.worlds.transformed import transformed, varied
 from evopolicy_coordinator import splits, worlds
-from evopolicy_coordinator.storage.state_folder import held
+from evopolicy_coordinator.storage.state_folder import held_folder
 from evopolicy_results.evaluations import Evaluations
 
 _COUNTS: dict[Split, int] = {"train": worlds.CASES, "validation": 1, "heldout": 1}
@@ -61,7 +61,7 @@ def accept_worlds(
     env_ids = catalogue.resolve(env or ["core16"])
     if others := [each for each in env_ids if each not in core16]:
         raise ConfigError(f"{others[0]} has no worlds; those of Core16 have some: {', '.join(core16)}")
-    with held(root):
+    with held_folder(root):
         secret = splits.load_or_create_secret(root / splits.SECRET)
         run_to_end(_accept(env_ids, policies, root / worlds.JOURNAL, secret))
     say(f"next: evopolicy-coordinator --state {root}")
@@ -98,7 +98,7 @@ class _Trials:
         """Tries candidates of an environment until enough are accepted."""
         policy = snapshot(folder) if (folder / "policy.py").is_file() else None
         digest = policy.digest if policy else ""
-        entries = worlds.of_environment(worlds.read(self._journal), self._epoch, env)
+        entries = worlds.of_environment(worlds.read_journal(self._journal), self._epoch, env)
         if not entries:
             new = worlds.Base(epoch=self._epoch, env=env, policy=digest)
             if policy is not None:

@@ -60,7 +60,7 @@ def load(state: State, snapshot: Snapshot, step: Step, drain: Callable[[State, S
         evaluation = evaluations.enter(state, each)
         if each.fingerprint_class is not None:
             pins.place(state, evaluation.flow, each.fingerprint_class, step)
-        evaluations.play(state, evaluation, step)
+        evaluations.queue_jobs(state, evaluation, step)
     while loading.reloaded:
         group = loading.reloaded.pop(0)
         if group.done and not group.closed:
@@ -89,7 +89,7 @@ def _run(state: State, run: Run, rows: list[SubmitRow], loading: Loading, step: 
             _spent(run, row)
         else:
             run.open = row.submit_index
-            submits.play(state, run, row, step)
+            submits.queue_jobs(state, run, row, step)
         if row.status == "ok" and row.val_mean is not None:
             heads = loading.heads.pop(submit_group(run.id, row.submit_index, "validation"), [])
             failed = sum(head.failure is not None for head in heads)

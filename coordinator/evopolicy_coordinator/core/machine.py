@@ -149,7 +149,7 @@ def _event(key: type, event: type[T], rule: Callable[[State, T, Step], None]) ->
 
 EVENTS: dict[type, Rule] = dict(
     (
-        _event(operator.CreateRun, events.RunCreated, runs.create),
+        _event(operator.CreateRun, events.RunRequested, runs.create),
         _request(operator.WaitRun, finished.waited),
         _request(operator.CancelRun, finalisation.cancel),
         _event(operator.Disclose, events.DisclosureRequested, journal.disclose),
@@ -184,7 +184,7 @@ def _news(
 
 
 NEWS: dict[tuple[type, str], tuple[Rule, ...]] = {
-    **_news(step.ResultsPersisted, "", results.take),
+    **_news(step.ResultsPersisted, "", results.take_results),
     **_news(step.EpisodesDone, "train", runs.played, submits.progressed),
     **_news(step.EpisodesDone, "validation heldout random", runs.played, finalisation.progressed),
     **_news(step.EpisodesDone, "evaluation", evaluations.progressed),
@@ -205,7 +205,7 @@ NEWS: dict[tuple[type, str], tuple[Rule, ...]] = {
 
 def _poll_ended(state: State, request: events.RequestId, this: Step) -> None:
     """Answer a long poll whose time is up with the current state."""
-    poll = state.polls.take(request)
+    poll = state.polls.take_poll(request)
     if poll is not None:
         POLLS[poll.kind](state, poll, this)
 

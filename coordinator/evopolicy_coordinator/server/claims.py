@@ -51,7 +51,7 @@ class Claims:
         self._one_at_a_time = asyncio.Lock()
         self._process = secrets.token_hex(8)
 
-    async def ask(self, message: Claim, now: float) -> ClaimState:
+    async def answer_claim(self, message: Claim, now: float) -> ClaimState:
         """Takes, renews, gives back or settles a claim.
 
         Raises RefusedError for an invalid request, StorageError when the disk refuses.

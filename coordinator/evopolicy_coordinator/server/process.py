@@ -48,7 +48,7 @@ from evopolicy_coordinator.storage.state_folder import (
     ROLES,
     InUseError,
     StateFolder,
-    held,
+    held_folder,
     reachable,
     resolve_listen,
 )
@@ -101,7 +101,7 @@ async def run(options: Options, stop: asyncio.Event, on_ready: Callable[[Ready],
     place, why = chosen_place(options.state.absolute(), ROWS, options.store), ""
     shared = SharedFiles(options.state.absolute(), options.seal_key)
     if isinstance(place, str):
-        with held(options.state.absolute()):  # before the folder gets an identity of its own
+        with held_folder(options.state.absolute()):  # before the folder gets an identity of its own
             await asyncio.to_thread(shared.join, place)
     elif options.seal_key is not None:
         raise ConfigError(
@@ -175,7 +175,7 @@ async def _lead(
         store = await asyncio.to_thread(Store, place, state.identity.operator_token)
         opened.callback(store.close)
         if isinstance(place, str):
-            await asyncio.to_thread(lambda: shared.take(store.sealed()))
+            await asyncio.to_thread(lambda: shared.take_sealed(store.sealed()))
         secret, note = secret_of(state.root, unjailed=options.unjailed)
         if options.data is not None:
             note = ""

@@ -57,7 +57,7 @@ from evopolicy_coordinator.core.contract.records import (
     SubmitRow,
 )
 from evopolicy_coordinator.pki import identity
-from evopolicy_coordinator.server.reason_texts import env_failure, operator_words, words
+from evopolicy_coordinator.server.reason_texts import env_failure, operator_words, reason_text
 from evopolicy_coordinator.server.request_checks import MAX_COUNT, finite_cursor, require
 from evopolicy_coordinator.server.uploads import Uploads
 from evopolicy_coordinator.storage.engines import Place
@@ -89,7 +89,7 @@ class ServiceReader:
         self._pages = ThreadPoolExecutor(_READERS, thread_name_prefix="pages")
         self._lanes = [ThreadPoolExecutor(1, thread_name_prefix=f"blobs-{n}") for n in range(_BLOB_LANES)]
 
-    def read(self, asked: Any, answer: Answer) -> None:
+    def answer_read(self, asked: Any, answer: Answer) -> None:
         """Replies to a `ReadEffect` of the core or an operator's request (`_READS`): with a page of results,
         outcomes of a finished run, published records of runs whose cases are disclosed, or a signature."""
         self._pages.submit(self._answer, partial(_READS[type(asked)], self, asked), answer)
@@ -229,7 +229,7 @@ class ServiceReader:
             cursor=after,
             episodes=tuple(feedback(each.outcome) for each in page),
             done=records.submit_done(row) if after >= upto else None,
-            waits_for=words(effect.waits_for),
+            waits_for=reason_text(effect.waits_for),
             held_s=effect.held_s,
             more=bool(page) and after < upto,
         )

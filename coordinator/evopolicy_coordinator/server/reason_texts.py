@@ -120,12 +120,14 @@ TEXTS: Mapping[str, str | Callable[..., str]] = {
 """By code: a text with placeholders for the reason's details, or a function of them."""
 
 
-def words(reason: Reason | None, state: Path | None = None) -> str:
+def reason_text(reason: Reason | None, state: Path | None = None) -> str:
     """A reason as text; empty for None. `state`: the folder that commands for the operator name."""
     if reason is None:
         return ""
     text = TEXTS[reason.code]
-    about = {name: words(each) if isinstance(each, Reason) else each for name, each in reason.about.items()}
+    about = {
+        name: reason_text(each) if isinstance(each, Reason) else each for name, each in reason.about.items()
+    }
     if not isinstance(text, str):
         return text(**about)
     return text.format(**about, state="STATE" if state is None else shlex.quote(str(state)))
@@ -140,17 +142,17 @@ def env_failure(reason: Reason | None) -> str:
 
 def operator_words(reason: Reason | None) -> str:
     """A reason as text for operators, with the reason for which an environment failed; empty for None."""
-    return ": ".join(filter(None, (words(reason), env_failure(reason))))
+    return ": ".join(filter(None, (reason_text(reason), env_failure(reason))))
 
 
 def message(effect: Reply | Refuse, state: Path | None = None) -> Message:
-    """The reply for the client: the effect's message, with its reason as text. `state` as in `words`."""
+    """The reply for the client: the effect's message, with its reason as text. `state` as in `reason_text`."""
     if isinstance(effect, Refuse):
-        return Refused(status=effect.status, message=words(effect.reason, state))
+        return Refused(status=effect.status, message=reason_text(effect.reason, state))
     reply = effect.message
     if effect.waits_for is None:
         return reply
-    text = words(effect.waits_for)
+    text = reason_text(effect.waits_for)
     if isinstance(reply, RunOpened | StateReply):
         return msgspec.structs.replace(reply, state=_with(reply.state, text))
     if isinstance(reply, RunProgress):

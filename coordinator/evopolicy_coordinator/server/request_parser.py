@@ -185,7 +185,7 @@ class RequestParser:
         require(size <= most, Refusal.BAD_BLOB, f"outcomes of {size:,} bytes; {most:,} are the limit")
         checks.check_stored(self._blobs, result.packed)
         try:
-            outcomes = codec.unpack_outcomes(self._blobs.read(result.packed.digest))
+            outcomes = codec.unpack_outcomes(self._blobs.read_blob(result.packed.digest))
         except ProtocolError as error:
             raise RefusedError(Refusal.BAD_BLOB, str(error)) from error
         return replace(result, episodes=outcomes, packed=None)

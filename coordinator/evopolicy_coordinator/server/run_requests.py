@@ -43,14 +43,14 @@ from evopolicy_coordinator.core.contract.events import (
     AnyEvent,
     DisclosureRequested,
     EvaluationRequested,
-    RunCreated,
+    RunRequested,
 )
 from evopolicy_coordinator.core.contract.reasons import because
 from evopolicy_coordinator.core.contract.records import EvaluationRow, RunRow
 from evopolicy_coordinator.core.runs.templates import RANDOM
 from evopolicy_coordinator.pki.identity import of_run
 from evopolicy_coordinator.server.reader import ServiceReader
-from evopolicy_coordinator.server.reason_texts import words
+from evopolicy_coordinator.server.reason_texts import reason_text
 from evopolicy_coordinator.server.request_checks import (
     MAX_COUNT,
     check_bundle,
@@ -101,7 +101,7 @@ class RunRequests:
             of = self._reader.replayed(message.settings.replay_of)
             row = self._run(message) if of is None else self._replay(message, of)
             require(message.run in ("", row.run), Refusal.UNKNOWN_RUN, f"unknown run {message.run[:64]!r}")
-            return RunCreated(**about, row=row)
+            return RunRequested(**about, row=row)
         if isinstance(message, operator.Rescore):
             of_run = self._reader.finished_with_result(message.run)
             return EvaluationRequested(**about, row=self.rescore(message, *of_run))
@@ -307,7 +307,7 @@ class RunRequests:
         env, taken = of.settings.env, (*of.train, *of.validation, *of.heldout)
         cases = self._source.further(catalogue.suite_of(env).name, env, m.name, m.n, taken)
         if cases.epoch in self._reader.revealed():
-            text = words(because("epoch_revealed", epoch=cases.epoch), self._reader.state)
+            text = reason_text(because("epoch_revealed", epoch=cases.epoch), self._reader.state)
             raise RefusedError(Refusal.BAD_REQUEST, text)
         return cases
 

@@ -52,7 +52,7 @@ from evopolicy_coordinator.server.core_host import CoreHost
 from evopolicy_coordinator.server.definitions import failed, undescribed
 from evopolicy_coordinator.server.monitoring.watchdog import LoopWatchdog
 from evopolicy_coordinator.server.reader import ServiceReader, answer_bytes, answer_to, damaged, lane_of
-from evopolicy_coordinator.server.reason_texts import message, operator_words, words
+from evopolicy_coordinator.server.reason_texts import message, operator_words, reason_text
 from evopolicy_coordinator.server.refused_workers import RefusedWorkers
 from evopolicy_coordinator.server.request_checks import finite_wait
 from evopolicy_coordinator.server.request_parser import Parsed, RequestParser
@@ -208,7 +208,7 @@ class Service:
         query.reply(self._status_bytes(core, parsed.message.max_age_s), lane_of(parsed.asker))
 
     def _serve_stored(self, core: Core, query: IncomingQuery, parsed: Parsed) -> None:
-        self._reader.read(parsed.message, answer_to(query, parsed.asker))
+        self._reader.answer_read(parsed.message, answer_to(query, parsed.asker))
 
     async def _serve_further_cases(self, core: Core, query: IncomingQuery, parsed: Parsed) -> Message:
         return await asyncio.to_thread(self._parser.runs.further_cases, parsed.message)
@@ -216,7 +216,7 @@ class Service:
     async def _serve_claim(self, core: Core, query: IncomingQuery, parsed: Parsed) -> Message:
         """Serves a claim without the core: claims change no run."""
         try:
-            return await self._claims.ask(parsed.message, self.host.now())
+            return await self._claims.answer_claim(parsed.message, self.host.now())
         except DamagedStoreError:
             raise
         except StorageError as error:
@@ -311,7 +311,7 @@ class Service:
         if awaited:
             self.host.handle(DescriptionAwaited(stimulus_id=self._stimulus_of(message), env=message.env))
 
-        def read() -> Message:
+        def read_environment() -> Message:
             row = self._reader.finished_run(message.run)
             return operator.EnvironmentState(
                 split_hashes=self._parser.runs.split_hashes(message, row),
@@ -322,7 +322,7 @@ class Service:
                 result=b"" if row is None else self._reader.result(message.run),
             )
 
-        return asyncio.to_thread(read)
+        return asyncio.to_thread(read_environment)
 
     def _serve_put(self, core: Core, query: IncomingQuery, parsed: Parsed) -> None:
         message = parsed.message
@@ -334,7 +334,7 @@ class Service:
             run = core.state.runs.get(parsed.asker)
             if run is None or run.state.phase != "open":
                 reason = core.over(parsed.asker)
-                raise RefusedError(REFUSALS[reason.code], words(reason))
+                raise RefusedError(REFUSALS[reason.code], reason_text(reason))
             run_id, submitted = run.id, frozenset(row.bundle for row in run.submits)
         answer = answer_to(query, parsed.asker)
         self._reader.put(f"{parsed.subtree}/{parsed.asker}", run_id, message, most, answer, submitted)
@@ -479,7 +479,7 @@ class Service:
                 return
             query, answer = pending.query, answer_to(pending.query, pending.asker)
             if isinstance(effect, ReadEffect):
-                self._reader.read(effect, answer)
+                self._reader.answer_read(effect, answer)
                 return
             reply = message(effect, self._reader.state)
             if isinstance(reply, operator.RunProgress):

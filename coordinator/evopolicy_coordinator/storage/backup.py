@@ -76,7 +76,7 @@ def _copy(state: Path, place: Place, folder: Path) -> tuple[int, int]:
     source, blobs = blobs_of(state, place), BlobStore(folder / "blobs")
     count, total = 0, database.stat().st_size
     for digest in source.digests():
-        data = source.read(digest)
+        data = source.read_blob(digest)
         blobs.put(data)
         count, total = count + 1, total + len(data)
     return count, total

@@ -34,7 +34,7 @@ from evopolicy_coordinator.storage.engines import (
     record_place,
 )
 from evopolicy_coordinator.storage.objects import ObjectBlobs, blobs_of, checked_blobs
-from evopolicy_coordinator.storage.state_folder import held, identity_of
+from evopolicy_coordinator.storage.state_folder import held_folder, identity_of
 from evopolicy_coordinator.storage.store import SCHEMA, TABLES, Store, rows
 
 _CHUNK_BYTES = 4 << 20
@@ -65,7 +65,7 @@ def move(root: Path, to: str) -> Moved:
     if source == target:
         raise ConfigError(f"--to {to}: the rows are there already")
     partial = root / f".{DATABASE}.partial"
-    with held(root):
+    with held_folder(root):
         if isinstance(target, Path):
             if target.exists():
                 raise ConfigError(f"--to {to}: {target} exists; rename it first")
@@ -101,15 +101,15 @@ def move_blobs(root: Path, to: str) -> int:
     if isinstance(known, str) and isinstance(wanted, str):
         raise ConfigError(f"--blobs {to}: the blobs are in {known}; move them to a folder first")
     place = place_of(root)
-    with held(root), contextlib.closing(connect(place, "rwc", _TIMEOUT_S)):
+    with held_folder(root), contextlib.closing(connect(place, "rwc", _TIMEOUT_S)):
         old, new = blobs_of(root, place, known), blobs_of(root, place, wanted)
         if isinstance(new, ObjectBlobs):
             new.claim(identity_of(root).operator_token)
             new.forget_all()
-        moved = [new.put(old.read(digest)) for digest in tuple(old.digests())]
+        moved = [new.put(old.read_blob(digest)) for digest in tuple(old.digests())]
         new.drop_unfinished()  # the copies too, so that the object store is read
         for digest in moved:
-            new.read(digest)
+            new.read_blob(digest)
         record_place(root, BLOBS, wanted)
     return len(moved)
 

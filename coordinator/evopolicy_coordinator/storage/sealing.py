@@ -56,11 +56,11 @@ class SharedFiles:
         self._version = 0
 
     def join(self, place: Place) -> None:
-        """Takes the files of a database that another coordinator may lead. Raises as `take`, and StorageError."""
+        """Takes the files of a database that another coordinator may lead. Raises as `take_sealed`; StorageError."""
         with contextlib.closing(Reader(place)) as reader:
-            self.take(reader.sealed())
+            self.take_sealed(reader.sealed())
 
-    def take(self, sealed: bytes | None) -> None:
+    def take_sealed(self, sealed: bytes | None) -> None:
         """Writes the files that another leader has changed. Raises ConfigError when the document cannot be opened, is
         older than the last one, or a file has changed on both sides."""
         noted, own = self._noted(), self._read()

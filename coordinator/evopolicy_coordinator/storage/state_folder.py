@@ -202,7 +202,7 @@ def cluster_of(root: Path) -> str:
 
 
 @contextlib.contextmanager
-def held(root: Path) -> Iterator[None]:
+def held_folder(root: Path) -> Iterator[None]:
     """The folder, locked against others. Raises ConfigError as `StateFolder.open`."""
     _make_private(root)
     lock_fd = lock(root)

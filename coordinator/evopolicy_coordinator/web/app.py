@@ -129,7 +129,7 @@ class Site:
                 return
             known = self.cluster is None or self.cluster.is_known
             open_runs = () if self.status is None else self.status.runs
-            self.runs = await asyncio.to_thread(self.reader.read, open_runs, cluster_is_known=known)
+            self.runs = await asyncio.to_thread(self.reader.read_runs, open_runs, cluster_is_known=known)
             self._scanned_at = time.monotonic()
             self._scan_s = self._scanned_at - began
 

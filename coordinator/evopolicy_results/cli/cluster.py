@@ -128,7 +128,7 @@ class Playing:
         if self._waiting.worth_saying(waits_for):
             self._progress.console.print(f"waiting for {waits_for}", soft_wrap=True)
 
-    async def play(
+    async def run_work(
         self, envs: list[str], tiers: set[Tier], work: Callable[[], Coroutine[Any, Any, None]]
     ) -> None:
         """Does the work. A cluster of the command's own gets workers first, with a slot for each core, and its failure

@@ -102,7 +102,7 @@ def rescore(
             packages = _packages(finished) if local else ()
             async with where.playing("rescore", console, packages) as playing:
 
-                async def play() -> None:
+                async def rescore_runs() -> None:
                     for run in finished:
                         playing.update(title=f"{run.record.agent.entry} on {run.record.env}")
                         try:
@@ -111,7 +111,7 @@ def rescore(
                             failed.append(f"{run.folder}: {error}")
 
                 envs = sorted({run.record.env for run in finished})
-                await playing.play(envs, {run.record.sandbox_tier for run in finished}, play)
+                await playing.run_work(envs, {run.record.sandbox_tier for run in finished}, rescore_runs)
 
         try:
             run_to_end(work())

@@ -89,14 +89,14 @@ def verify(
             total = sum(len(indexes) * (1 + (one.split == "train")) for one, indexes in chosen)
             playing.update(total=total)
 
-            async def play() -> None:
+            async def replay_chosen() -> None:
                 for played, indexes in chosen:
                     await verifier.replay(played, indexes)
                     if played.split == "train":
                         await verifier.play_policy(played, indexes)
                 await verifier.check_fingerprint()
 
-            await playing.play([finished.record.env], {finished.record.sandbox_tier}, play)
+            await playing.run_work([finished.record.env], {finished.record.sandbox_tier}, replay_chosen)
         return verifier.report
 
     with fail_on_our_errors():

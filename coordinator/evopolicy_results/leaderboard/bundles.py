@@ -130,7 +130,7 @@ def _refusal(checked: Checked, seen: Mapping[tuple[str, str], str]) -> str:
 
 def _read_runs(archive: Archive, bundle: LabBundle, folder: Path) -> None:
     """Unpacks the runs below `folder`, and reads them as a report does."""
-    lines = contents.journal_entries(archive.read(contents.JOURNAL, contents.MAX_RECORDING_BYTES))
+    lines = contents.journal_entries(archive.read_file(contents.JOURNAL, contents.MAX_RECORDING_BYTES))
     bundle.heads = journal.heads(lines)
     by_folder = {folder / run.folder: run for run in bundle.checked.runs}
     for place, run in by_folder.items():

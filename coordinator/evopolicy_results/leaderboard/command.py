@@ -81,12 +81,12 @@ def leaderboard(
         share = share_of("--replay", replay)
         check_writable(out, "--out")
 
-        def play(archive: Archive, checked: Checked) -> None:
+        def replay_share(archive: Archive, checked: Checked) -> None:
             if share is not None:
                 asyncio.run(replayed(archive, checked, share, lambda played, total: None))
 
         try:
-            bundles = read_bundles(files, labs, Path(folder), play)
+            bundles = read_bundles(files, labs, Path(folder), replay_share)
         except OSError as error:
             raise ConfigError(f"{error.filename}: {error.strerror}") from error
         shown = [bundle for bundle in bundles if not bundle.refused]

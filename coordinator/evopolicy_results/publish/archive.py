@@ -69,7 +69,7 @@ class Archive:
         """Of all files."""
         return frozenset(self._places)
 
-    def read(self, name: str, most: int) -> bytes:
+    def read_file(self, name: str, most: int) -> bytes:
         """A file's bytes. ProtocolError when there is none of that name, it is damaged, or longer than `most`."""
         place = self._places.get(name)
         if place is None:

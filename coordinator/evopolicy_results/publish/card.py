@@ -275,7 +275,7 @@ def _conditions(records: Sequence[RunRecord]) -> dict[str, dict[str, dict[str, i
         versions = record.versions
         settings: dict[str, Any] = msgspec.to_builtins(record.experiment_dimensions)
         limits, resources = settings.pop("limits") or {}, record.agent.resources
-        entry = catalogue.known(record.env)
+        entry = catalogue.known_entry(record.env)
         topics: dict[str, dict[str, Any]] = {
             "isolation": {
                 "policies' sandbox": record.line.sandbox_tier,

@@ -199,7 +199,7 @@ class Listed(msgspec.Struct, frozen=True, kw_only=True):
     """The run that was opened later in its place; empty for none."""
 
 
-def listing(entries: Iterable[journal.Entry], published: Iterable[str]) -> tuple[Listed, ...]:
+def listing(entries: Iterable[journal.EpochEntry], published: Iterable[str]) -> tuple[Listed, ...]:
     """Every run in the journal of the `published` runs' entries, and the runs from which the published ones start, in
     the order in which they were opened."""
     chosen, entries = set(published), list(entries)

@@ -66,7 +66,7 @@ class Files(Protocol):
     @property
     def names(self) -> frozenset[str]: ...
 
-    def read(self, name: str, most: int) -> bytes:
+    def read_file(self, name: str, most: int) -> bytes:
         """ProtocolError for a file that is not there, damaged, or larger than `most`."""
 
 
@@ -94,7 +94,7 @@ class PublishedRun(msgspec.Struct, frozen=True, kw_only=True):
         path = f"{self.folder}/actions/{group}"
         if path not in files.names:
             return []
-        return contents.unpack_recordings(files.read(path, contents.MAX_RECORDING_BYTES))
+        return contents.unpack_recordings(files.read_file(path, contents.MAX_RECORDING_BYTES))
 
     def policies(self, files: Files, damaged: Collection[str] = ()) -> Iterator[tuple[int, Bundle | str]]:
         """By index of each submit with a policy: the published policy, or why there is none; empty where it was
@@ -104,7 +104,9 @@ class PublishedRun(msgspec.Struct, frozen=True, kw_only=True):
             policy: Bundle | str = ""
             if submit.bundle and path in files.names and path not in damaged:
                 try:
-                    policy = bundles.load(files.read(path, contents.MAX_DOCUMENT_BYTES * 2), submit.bundle)
+                    policy = bundles.load(
+                        files.read_file(path, contents.MAX_DOCUMENT_BYTES * 2), submit.bundle
+                    )
                 except (BundleError, ProtocolError) as error:
                     policy = str(error)
             if submit.bundle:
@@ -192,7 +194,7 @@ class Fault(NamedTuple):
 class History(NamedTuple):
     """The journal: its entries, and the head after each."""
 
-    entries: list[journal.Entry]
+    entries: list[journal.EpochEntry]
     heads: list[str]
 
     def entry(self, kind: type[T], run: str) -> tuple[int, T] | None:

@@ -264,12 +264,12 @@ async def play_runs(
     total = sum(len(each.indexes) for parts in by_run.values() for each in parts)
     played = 0
 
-    def told(count: int, waits_for: str) -> None:
+    def tell_played(count: int, waits_for: str) -> None:
         tell(played + count, total)
 
     for (offered, _), runs in clusters.items():
         try:
-            async with _cluster_of(runs, told, offered) as evaluations:
+            async with _cluster_of(runs, tell_played, offered) as evaluations:
                 for run in runs:
                     why_not, other_cpu = await unplayable(evaluations, run)
                     if why_not:

@@ -101,7 +101,7 @@ def _manifest(files: Files, identity: str, checked: Checked) -> Manifest | None:
         checked.add("format", "failed", str(error))
         return None
     checked.add("format", "ok", f"version {manifest.version}, made by evopolicy {manifest.software}")
-    signed = contents.digest(files.read(contents.MANIFEST, contents.MAX_DOCUMENT_BYTES))
+    signed = contents.digest(files.read_file(contents.MANIFEST, contents.MAX_DOCUMENT_BYTES))
     if not signed_by(signature.key, signature.signature, signed):
         checked.add("signature", "failed", f"not a signature of this manifest by {signature.key[:64]}")
         return manifest
@@ -121,7 +121,7 @@ def _manifest(files: Files, identity: str, checked: Checked) -> Manifest | None:
 
 def _document(files: Files, name: str, kind: Callable[..., T] | type[T], checked: Checked) -> T:
     """A file's content. Raises ProtocolError for a damaged one. `checked` receives its unknown fields and claims."""
-    data = files.read(name, contents.MAX_DOCUMENT_BYTES)
+    data = files.read_file(name, contents.MAX_DOCUMENT_BYTES)
     content = decoded(name, data, kind)
     checked.refuse_unknown(name, fields.parsed(name, data))
     return content
@@ -152,7 +152,7 @@ def _digests(files: Files, manifest: Manifest, checked: Checked) -> tuple[set[st
     damaged: set[str] = set()
     for name in sorted(wanted.keys() & files.names):
         try:
-            actual = contents.digest(files.read(name, contents.MAX_RECORDING_BYTES))
+            actual = contents.digest(files.read_file(name, contents.MAX_RECORDING_BYTES))
             fault = f"{name} was changed" if actual != wanted[name] else ""
         except ProtocolError as error:
             fault = str(error)
@@ -167,7 +167,7 @@ def _digests(files: Files, manifest: Manifest, checked: Checked) -> tuple[set[st
 
 def _journal(files: Files, manifest: Manifest, checked: Checked) -> History:
     try:
-        lines = contents.journal_entries(files.read(contents.JOURNAL, contents.MAX_RECORDING_BYTES))
+        lines = contents.journal_entries(files.read_file(contents.JOURNAL, contents.MAX_RECORDING_BYTES))
         entries = [journal.read_entry(line) for line in lines]
         for line in lines:
             fields.parsed(contents.JOURNAL, line)
@@ -209,7 +209,7 @@ def _order(
         yield "ok", f"the journal had entry {number} with the head {by}; {opened} opened after it"
 
 
-def _history_fault(entries: Sequence[journal.Entry]) -> str | None:
+def _history_fault(entries: Sequence[journal.EpochEntry]) -> str | None:
     """A contradiction in the order of the entries; None if there is none."""
     still_open: dict[str, str] = {}
     seen: set[str] = set()
@@ -238,7 +238,7 @@ def _descriptions(files: Files, manifest: Manifest, digests: Mapping[str, str], 
     if checked.failed:
         return
     try:
-        data = {name: files.read(name, contents.MAX_DOCUMENT_BYTES) for name in contents.DESCRIPTIONS}
+        data = {name: files.read_file(name, contents.MAX_DOCUMENT_BYTES) for name in contents.DESCRIPTIONS}
         card = _document(files, contents.CARD, cards.Card, checked)
     except ProtocolError as error:
         checked.add("card", "failed", str(error))
@@ -251,7 +251,7 @@ def _descriptions(files: Files, manifest: Manifest, digests: Mapping[str, str], 
         return
     own = cards.make(
         [cards.Source(run.folder, run.record, run.result) for run in checked.runs],
-        contents.journal_entries(files.read(contents.JOURNAL, contents.MAX_RECORDING_BYTES)),
+        contents.journal_entries(files.read_file(contents.JOURNAL, contents.MAX_RECORDING_BYTES)),
         signer=checked.signer,
         software=manifest.software,
         licence=card.licence,

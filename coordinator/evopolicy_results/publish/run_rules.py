@@ -48,7 +48,7 @@ _DOCUMENTS = (contents.OPENING, contents.RESULT, contents.EPISODES, contents.RUN
 def read_run(files: Files, folder: str, checked: Checked) -> PublishedRun | None:
     place = {name: f"{folder}/{name}" for name in (*_DOCUMENTS, contents.SALT)}
     try:
-        data = {name: files.read(path, contents.MAX_DOCUMENT_BYTES) for name, path in place.items()}
+        data = {name: files.read_file(path, contents.MAX_DOCUMENT_BYTES) for name, path in place.items()}
         written = {name: fields.parsed(place[name], data[name]) for name in _DOCUMENTS}
         salt = data[contents.SALT].decode("ascii", "replace")
         run = PublishedRun(

@@ -57,7 +57,7 @@ def answers_of(study: Study) -> Answers:
         )
     return Answers(
         scope=", ".join(scope),
-        leaders=tuple(_leader(suite) for suite in study.suites),
+        leaders=tuple((_of_ranks if each.is_ranked else _of_returns)(each) for each in study.suites),
         cost=_cost(study.runs),
         troubles=tuple(_troubles(study, cells)),
     )
@@ -73,10 +73,6 @@ def _names(names: Sequence[str]) -> str:
     if more > 0:
         return f"{', '.join(shown)} and {more} more"
     return " and ".join(filter(None, (", ".join(shown[:-1]), shown[-1])))
-
-
-def _leader(suite: Suite) -> Leader:
-    return _of_ranks(suite) if suite.is_ranked else _of_returns(suite)
 
 
 def _of_ranks(suite: Suite) -> Leader:

@@ -67,7 +67,7 @@ def differences(run: RunUnderTest, result: RunResult | None) -> Iterator[tuple[s
     for index, digest in run.record.trees.items():
         name = trees.name_of(run.root, int(index))
         try:
-            own = trees.read(run.root, name)[1]
+            own = trees.read_tree(run.root, name)[1]
         except ConfigError as error:
             yield "trees", str(error)
         else:

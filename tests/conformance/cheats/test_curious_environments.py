@@ -71,7 +71,7 @@ def played(
             await slot.start()
             (description,) = await slot.describe([definition.id])
             job = make_job(env=definition.id, bundle=None, tier=tier)
-            (outcome,) = await slot.play(job, None, lambda episodes, steps: None)
+            (outcome,) = await slot.play_job(job, None, lambda episodes, steps: None)
             return description, rows(outcome)[0].info
         finally:
             await slot.close()

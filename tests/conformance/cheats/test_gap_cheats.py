@@ -72,7 +72,7 @@ def test_as_much_is_sent_between_two_hidden_episodes_as_between_train_ones(
         job = make_job(env="gymnasium/ALE/Pong-v5", n=3, max_steps=9, policy_scope="submit", **options)
         with monkeypatch.context() as patch:
             patch.setattr(slot, "_reply", noted)
-            slots.run(slot.play(job, slots.bundle(policy), lambda *_: None))
+            slots.run(slot.play_job(job, slots.bundle(policy), lambda *_: None))
         sizes[kind] = [len(msgspec.msgpack.encode(message)) for message in received]
         assert all(message.outcome.failure is None for message in received)
     assert sizes["train"][0] > 5_000

@@ -124,7 +124,9 @@ def attempts(slots: Slots, tier: Tier) -> dict[str, str]:
         try:
             await slot.start()
             with pytest.raises(WorkerError) as caught:
-                await slot.play(make_job(env=ENV, bundle=None, tier=tier), None, lambda episodes, steps: None)
+                await slot.play_job(
+                    make_job(env=ENV, bundle=None, tier=tier), None, lambda episodes, steps: None
+                )
             return str(caught.value)
         finally:
             await slot.close()
@@ -172,7 +174,8 @@ def test_a_simulator_that_prints_or_sends_out_of_turn_ends_its_slot(
         await slot.start()
         with pytest.raises(WorkerError, match="cannot be read"):
             await asyncio.wait_for(
-                slot.play(make_job(env=ENV, bundle=None, tier=tier), None, lambda episodes, steps: None), 60
+                slot.play_job(make_job(env=ENV, bundle=None, tier=tier), None, lambda episodes, steps: None),
+                60,
             )
         await slot.close()
 
@@ -192,7 +195,7 @@ def test_graphics_devices_are_there_for_videos_only(
     async def play(slot: Slot, video: bool) -> str:
         job = make_job(env=ENV, bundle=None, video=video)
         with pytest.raises(WorkerError) as caught:
-            await slot.play(job, None, lambda episodes, steps: None)
+            await slot.play_job(job, None, lambda episodes, steps: None)
         return str(caught.value)
 
     slot = slots.new()

@@ -54,7 +54,7 @@ class Probed:
         self.record: RunRecord = decode_run_record((folder / "run.json").read_bytes())
         feedback = folder / "workspace" / "feedback" / "submit_000" / "episodes" / "ep_000"
         self.names = (feedback / "stdout.txt").read_text().splitlines()
-        found = credentials.read(Path(cheated.credentials["operator"]))
+        found = credentials.read_credentials(Path(cheated.credentials["operator"]))
         splits: tuple[Split, ...] = ("train", "validation", "heldout")
         self.seen = {split: asyncio.run(self._facts(found, split)) for split in splits}
 

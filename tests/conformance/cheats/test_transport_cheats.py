@@ -130,10 +130,10 @@ async def test_a_captured_submit_that_is_sent_again_is_charged_and_played_once(
         link = thief.ask._link
         cluster = link.credentials.cluster
         for _ in range(5):
-            reply = await link.ask(keys.gateway_key(cluster, owner.run, "submit"), captured, 10)
+            reply = await link.query(keys.gateway_key(cluster, owner.run, "submit"), captured, 10)
             assert codec.decode(codec.gateway_replies, reply) == first
         # On the thief's own key the same bytes are of another run.
-        reply = await link.ask(keys.gateway_key(cluster, thief.run, "submit"), captured, 10)
+        reply = await link.query(keys.gateway_key(cluster, thief.run, "submit"), captured, 10)
         refused = codec.decode(codec.gateway_replies, reply)
         assert isinstance(refused, Refused)
         assert refused.status == "wrong_key"
@@ -144,7 +144,7 @@ async def test_a_captured_submit_that_is_sent_again_is_charged_and_played_once(
         )
         await owner.close()
         # Sent again when the run is over it is the same submit still, or none.
-        reply = await link.ask(keys.gateway_key(cluster, owner.run, "submit"), captured, 10)
+        reply = await link.query(keys.gateway_key(cluster, owner.run, "submit"), captured, 10)
         assert isinstance(codec.decode(codec.gateway_replies, reply), Refused | gateway.SubmitAccepted)
         finished = await client.finished(owner.run)
         assert (finished.budget_used, len(finished.submits)) == (2, 1)

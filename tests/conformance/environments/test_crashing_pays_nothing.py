@@ -48,14 +48,16 @@ def outcomes(tmp_path_factory: pytest.TempPathFactory) -> dict[tuple[str, str], 
         await slot.start()
         try:
             for env in STEPS_COST:
-                found[env, "random"] = await slot.play(job(env, None), None, lambda done, steps: None)
+                found[env, "random"] = await slot.play_job(job(env, None), None, lambda done, steps: None)
                 for way, methods in WAYS.items():
                     bundle = scratch / way.replace(" ", "-")
                     bundle.mkdir(exist_ok=True)
                     (bundle / "policy.py").write_text(
                         f"class Policy:\n    def __init__(self, o, a, m): pass\n    {methods}\n"
                     )
-                    found[env, way] = await slot.play(job(env, "0" * 64), bundle, lambda done, steps: None)
+                    found[env, way] = await slot.play_job(
+                        job(env, "0" * 64), bundle, lambda done, steps: None
+                    )
         finally:
             await slot.close()
         return found

@@ -96,7 +96,7 @@ def test_the_suite_of_the_papers_families_has_all_their_environments() -> None:
 
 @pytest.mark.parametrize("env_id", SAMPLE)
 def test_an_environment_keeps_what_the_interface_promises(env_id: str) -> None:
-    played = conformance.play(env_id, 40)
+    played = conformance.play_checked(env_id, 40)
     assert played.verdict(None) == "ok"
     assert played.limit == catalogue.entry(env_id).max_episode_steps
 
@@ -183,7 +183,9 @@ def test_check_env_names_what_is_not_kept_and_goes_on(
     results = tmp_path / "results.jsonl"
     done = CliRunner().invoke(cli.app, ["check-env", "--results", str(results), *ids])
     assert done.exit_code == 1, done.output
-    verdicts = {name.partition(":")[2]: each.verdict for name, each in check_env.read(results).items()}
+    verdicts = {
+        name.partition(":")[2]: each.verdict for name, each in check_env.read_checked(results).items()
+    }
     assert "outside its space" in verdicts["outside-v0"]
     assert "another episode" in verdicts["unseeded-v0"]
     assert "status" in verdicts["dies-v0"]

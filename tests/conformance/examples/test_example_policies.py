@@ -44,7 +44,7 @@ async def play(slot: Slot, env: str) -> float:
             for i in range(N_CASES)
         ),
     )
-    outcomes = await slot.play(job, catalogue.policy_folder(POLICIES, env), lambda done, steps: None)
+    outcomes = await slot.play_job(job, catalogue.policy_folder(POLICIES, env), lambda done, steps: None)
     assert [outcome.failure for outcome in outcomes] == [None] * N_CASES, env
     return sum(outcome.episode_return for outcome in outcomes) / N_CASES
 

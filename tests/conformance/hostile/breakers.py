@@ -150,7 +150,7 @@ PLAIN: dict[str | None, dict[str, str]] = {
         "a replaced shim": (
             "import gc\n            for m in list(sys.modules.values()):\n                for n in ('encoded', 'reply',"
             " 'answer', 'check', 'seal'):\n                    if hasattr(m, n) and hasattr(m, 'REPLIES'): setattr(m,"
-            " n, None)\n            m = sys.modules['__main__']; m.player.encoded = lambda action:"
+            " n, None)\n            m = sys.modules['__main__']; m.policy_server.encoded = lambda action:"
             " struct.pack('<IBxxxd', 8, 2, 9.0)"
         ),
         "all modules deleted": "sys.modules.clear(); sys.stdout = sys.stderr = None; return []",

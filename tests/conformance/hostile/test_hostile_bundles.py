@@ -13,7 +13,7 @@ from evopolicy_common.errors import BundleError
 from evopolicy_common.records.blobs import BlobStore
 from evopolicy_common.records.policies import bundles
 from evopolicy_common.records.policies.bundles import BundleFile
-from evopolicy_gateway.submits.snapshots import take
+from evopolicy_gateway.submits.snapshots import take_snapshot
 
 
 def folders(tmp_path: Path) -> tuple[Path, Path]:
@@ -30,7 +30,7 @@ def folders(tmp_path: Path) -> tuple[Path, Path]:
 def test_a_hostile_folder_has_a_verdict_and_no_bundle(tmp_path: Path, attack: BundleAttack) -> None:
     system, secret = folders(tmp_path)
     attack.spoil(system, secret)
-    taken = take(system, BlobStore(tmp_path / "blobs"))
+    taken = take_snapshot(system, BlobStore(tmp_path / "blobs"))
     assert taken.digest is None
     assert taken.error is not None
     assert taken.error.category == attack.verdict

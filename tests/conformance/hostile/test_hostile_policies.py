@@ -375,7 +375,9 @@ def test_policies_in_parallel_slots_cannot_talk(slots: Slots, way: str) -> None:
         plays = []
         for slot, role in zip(pair, ("tell", "listen"), strict=True):
             folder = slots.bundle(probing("talk", {"role": role, "way": way}))
-            plays.append(slot.play(make_job(tier=tier, limits=PATIENT), folder, lambda episodes, steps: None))
+            plays.append(
+                slot.play_job(make_job(tier=tier, limits=PATIENT), folder, lambda episodes, steps: None)
+            )
         (_,), (listener,) = slots.run(both(*plays))
         heard[tier] = attempts(listener)["THROUGH"] != []
     assert heard == {"bwrap": False, "none": True}
@@ -429,5 +431,5 @@ def test_a_link_in_an_unpacked_bundle_is_never_followed(slots: Slots, target: di
     folder = slots.bundle(HONEST)
     (folder / "data.txt").symlink_to(target["secret_file"])
     with pytest.raises(WorkerError, match="cannot be read"):
-        slots.run(slots.slot().play(make_job(), folder, lambda episodes, steps: None))
+        slots.run(slots.slot().play_job(make_job(), folder, lambda episodes, steps: None))
     assert serves_honestly(slots)

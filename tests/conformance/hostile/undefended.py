@@ -1,5 +1,5 @@
-"""A player without any defence: the policy lives in the environment's own process, and its results are pickles on a
-pipe.
+"""A policy server without any defence: the policy lives in the environment's own process, and its results are pickles
+on a pipe.
 
 What a breaker does to it is what it is worth; `harmed` tells. Run as a program, with descriptors 3 (a byte for each
 step) and 4 (results: length and pickle), it plays the `policy.py` of the folder that it is given. The results are
@@ -29,7 +29,7 @@ COMMANDS, REPLIES = 3, 4
 _LENGTH = struct.Struct("<I")
 _TIMEOUT_S = 1.5
 
-player: Any = sys.modules[__name__]
+policy_server: Any = sys.modules[__name__]
 
 
 def encoded(action: Any) -> bytes:
@@ -55,7 +55,7 @@ def play(folder: str) -> None:
         position += float(np.asarray(action, dtype=np.float64).reshape(-1)[0])
         if not np.isfinite(position):
             raise FloatingPointError("the state is not finite any more")
-        os.write(REPLIES, player.encoded(action))
+        os.write(REPLIES, policy_server.encoded(action))
 
 
 def harmed(source: str, timeout_s: float = _TIMEOUT_S) -> str | None:

@@ -119,7 +119,7 @@ def replayed(slots: Slots, slot: Slot, env: str, outcome: EpisodeOutcome) -> Epi
     job = make_job(env=env, bundle=None)
     spec = msgspec.structs.replace(job.episodes[0], replay=outcome.trajectory)
     job = msgspec.structs.replace(job, episodes=(spec,))
-    (again,) = slots.run(slot.play(job, None, lambda *progress: None))
+    (again,) = slots.run(slot.play_job(job, None, lambda *progress: None))
     return again
 
 

@@ -55,7 +55,7 @@ def test_the_golden_states_journal_outcomes_and_result_are_read(state: Path) -> 
             len(reader.outcomes(submit_group(opened.run, n, "train"), 0, 9, 1 << 20)) for n in (0, 1)
         ] == [2, 3]
         assert reader.one(DocumentRow, run=opened.run, kind="result") is not None
-        assert all(blobs.read(digest) for digest in reader.bundles(opened.run) if digest is not None)
+        assert all(blobs.read_blob(digest) for digest in reader.bundles(opened.run) if digest is not None)
 
 
 def test_commands_on_the_golden_state_find_its_run(state: Path) -> None:

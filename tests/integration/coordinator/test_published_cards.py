@@ -119,7 +119,7 @@ def test_descriptions_are_valid_for_mlcroissant_without_a_network(results: Resul
         code=0,
     )
     unpacked = tmp_path / "unpacked"
-    for name, data in results.read(str(folder / "licensed.evp")).items():
+    for name, data in results.read_file(str(folder / "licensed.evp")).items():
         (unpacked / name).parent.mkdir(parents=True, exist_ok=True)
         (unpacked / name).write_bytes(data)
     assert (folder / contents.CARD).read_bytes() == (unpacked / contents.CARD).read_bytes()

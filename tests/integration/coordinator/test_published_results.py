@@ -213,7 +213,7 @@ def test_signing_anew_alone_is_another_signer(results: Results) -> None:
 def test_selected_runs_show_what_they_were_selected_from(results: Results) -> None:
     summary = results.publish("one.evp", results.run_folder("second"))
     assert [(each["exp_id"], each["state"]) for each in summary["left_out"]] == [("first", "completed")]
-    checked = rules.check(Held(results.read("one.evp")))
+    checked = rules.check(Held(results.read_file("one.evp")))
     assert not checked.failed
     assert [each.text for each in checked.findings if each.kind == "completeness"] == [
         "1 of 2 runs of these entries and their starts are left out (1 completed): these runs were selected"
@@ -282,7 +282,7 @@ def test_a_policy_that_tells_of_the_machine_is_withheld(results: Results) -> Non
     args = ("publish", "leaky", "--out", "leaky.evp", "--local", *state, "--json")
     document = json.loads(evopolicy(results.root, *args).stdout)
     assert any("checkpoints/000" in each["what"] for each in document["removed"])
-    files = results.read("leaky.evp")
+    files = results.read_file("leaky.evp")
     assert not any("checkpoints" in name for name in files)
     checked = rules.check(Held(files))
     assert not checked.failed
@@ -408,8 +408,8 @@ def test_logs_are_published_only_on_request_and_without_what_the_search_finds(re
         summary = results.publish("logs.evp", str(folder), "--with-logs")
     finally:
         log.write_bytes(before)
-    assert "runs/0000/logs/agent.jsonl" not in results.read("no-logs.evp")
-    data = results.read("logs.evp")["runs/0000/logs/agent.jsonl"]
+    assert "runs/0000/logs/agent.jsonl" not in results.read_file("no-logs.evp")
+    data = results.read_file("logs.evp")["runs/0000/logs/agent.jsonl"]
     assert b"https://example.org/x" in data
     assert secret.encode() not in data
     assert str(results.root).encode() not in data

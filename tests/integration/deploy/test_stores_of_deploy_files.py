@@ -60,7 +60,7 @@ def test_the_compose_files_object_store_takes_blobs_with_the_readmes_keys(
     blobs.claim("ours")
     blobs.put(b"a bundle")
     blobs.drop_unfinished()
-    assert blobs.read(digest_of(b"a bundle")) == b"a bundle"
+    assert blobs.read_blob(digest_of(b"a bundle")) == b"a bundle"
     blobs.sweep()
     assert blobs.delete(digest_of(b"a bundle")) == len(b"a bundle")
     store.close()

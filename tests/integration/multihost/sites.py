@@ -194,7 +194,7 @@ class Sites:
 
         async def ask() -> StatusReply:
             deadline = time.monotonic() + TIMEOUT_S
-            async with connect(credentials.read(Path(self.own["operator"]))) as link:
+            async with connect(credentials.read_credentials(Path(self.own["operator"]))) as link:
                 client = OperatorClient(link)
                 message = StatusRequest(token=client.token)
                 while time.monotonic() < deadline:

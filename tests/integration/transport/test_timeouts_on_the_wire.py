@@ -114,7 +114,7 @@ async def test_a_session_that_is_stuck_is_given_up(monkeypatch: pytest.MonkeyPat
     found = Credentials(cluster="c", role="operator", endpoints=(), user="o", password="", token="")
     link = Link(stuck, found)  # type: ignore[arg-type]
     with pytest.raises(TransportError, match="no answer"):
-        await link.ask("evopolicy/v1/c/ops/status", b"", 0.0)
+        await link.query("evopolicy/v1/c/ops/status", b"", 0.0)
     await asyncio.to_thread(link.close)
     stuck.released.set()
 

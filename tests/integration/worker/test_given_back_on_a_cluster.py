@@ -126,7 +126,7 @@ class Stored:
             ref = msgspec.msgpack.decode(data, type=BegunRow).begun
             if ref is not None:
                 job = Job(job_id="", env="", bundle="b", episodes=(), record="actions", begun=ref)
-                inline = ref.inline or self._blobs.read(ref.digest)
+                inline = ref.inline or self._blobs.read_blob(ref.digest)
                 job = msgspec.structs.replace(job, begun=msgspec.structs.replace(ref, inline=inline))
                 return [float(each.action[0]) for each in begun.unpack(job)[0].unpacked().taken]
         return []
@@ -136,7 +136,7 @@ class Stored:
         for data in self._rows("outcomes", group):
             recording = msgspec.msgpack.decode(data, type=OutcomeRow).outcome.trajectory
             assert recording is not None
-            return actions_of(recording.inline or self._blobs.read(recording.digest))
+            return actions_of(recording.inline or self._blobs.read_blob(recording.digest))
         return []
 
 

@@ -71,7 +71,7 @@ class ScriptedSlot:
         await self.start()
         self.prepared = tuple(env_ids)
 
-    async def play(
+    async def play_job(
         self, job: Job, bundle: Path | None, on_progress: Callable[[int, int], None]
     ) -> tuple[EpisodeOutcome, ...]:
         assert (bundle is None) == (job.bundle is None)

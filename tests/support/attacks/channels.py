@@ -264,7 +264,7 @@ def between_policies(slots: Slots, cores: tuple[int, int], n: int = 80) -> float
         plays = []
         for slot, source in zip(pair, (WRITER, LISTENER), strict=True):
             folder = slots.bundle({"policy.py": source, "given.json": json.dumps(parameters)})
-            plays.append(slot.play(make_job(limits=LIMITS), folder, lambda episodes, steps: None))
+            plays.append(slot.play_job(make_job(limits=LIMITS), folder, lambda episodes, steps: None))
 
         async def both() -> Any:
             return await asyncio.gather(*plays)
@@ -314,7 +314,7 @@ def play(slots: Slots, parameters: dict[str, Any]) -> None:
     """One episode of the writer."""
     folder = slots.bundle({"policy.py": WRITER, "given.json": json.dumps(parameters)})
     (outcome,) = slots.run(
-        slots.slot().play(make_job(limits=LIMITS), folder, lambda episodes, steps: None), timeout_s=300.0
+        slots.slot().play_job(make_job(limits=LIMITS), folder, lambda episodes, steps: None), timeout_s=300.0
     )
     assert outcome.failure is None, outcome.failure
 

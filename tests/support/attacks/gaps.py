@@ -95,7 +95,9 @@ def collect(
             **KINDS[kind],
         )
         next_seed[kind] += per_policy
-        outcomes = slots.run(slots.slot().play(job, slots.bundle(policy), lambda *_: None), timeout_s=900.0)
+        outcomes = slots.run(
+            slots.slot().play_job(job, slots.bundle(policy), lambda *_: None), timeout_s=900.0
+        )
         for outcome in outcomes[per_policy > 1 :]:
             assert outcome.failure is None, outcome.failure
             if outcome.stdout:

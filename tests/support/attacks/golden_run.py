@@ -94,7 +94,7 @@ class GoldenCluster:
 
     def through(self, wiretap: Wiretap, role: credentials.Role, file: Path) -> Path:
         """The role's credentials with the wiretap in the coordinator's place."""
-        found = credentials.read(Path(self.files[role]))
+        found = credentials.read_credentials(Path(self.files[role]))
         credentials.write(msgspec.structs.replace(found, endpoints=(wiretap.endpoint,)), file)
         return file
 
@@ -117,7 +117,7 @@ class GoldenCluster:
         """The coordinator's replies to an operator."""
 
         async def main() -> Any:
-            async with connect(credentials.read(Path(self.files["operator"]))) as link:
+            async with connect(credentials.read_credentials(Path(self.files["operator"]))) as link:
                 return await question(OperatorClient(link))
 
         return asyncio.run(asyncio.wait_for(main(), 2 * TIMEOUT_S))

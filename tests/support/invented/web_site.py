@@ -24,7 +24,7 @@ TOKEN = "r" * 43
 NOBODY = Credentials(
     cluster="c", role="operator", endpoints=("tcp/127.0.0.1:1",), user="u", password="p", token="t"
 )
-"""A cluster that is never connected to: its status is told to `Site.cluster.take`."""
+"""A cluster that is never connected to: its status is told to `Site.cluster.take_status`."""
 
 
 def site_of(*roots: Path, cluster: StatusReply | None = None, **more: Any) -> Site:
@@ -36,7 +36,7 @@ def site_of(*roots: Path, cluster: StatusReply | None = None, **more: Any) -> Si
         **more,
     )
     if cluster is not None:
-        site.cluster.take(cluster)
+        site.cluster.take_status(cluster)
     return site
 
 

@@ -34,5 +34,5 @@ async def answered(link: Link, key: str, timeout_s: float = 20.0, attempts: int 
         if attempt:
             await asyncio.sleep(0.1)
         with contextlib.suppress(TransportError):
-            return await link.ask(key, b"?", timeout_s) == b"coordinator"
+            return await link.query(key, b"?", timeout_s) == b"coordinator"
     return False

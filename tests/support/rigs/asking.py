@@ -16,7 +16,7 @@ _RENAMED = {"sandbox_tier": "tier"}
 def asked(kind: type[Message], *, request: events.RequestId, **fields: Any) -> events.Requested[Any]:
     """Somebody sent a message of this kind: `fields` are the message's and those that the shell adds to it."""
     if kind is operator.CreateRun:
-        return _with_row(kind, RunRow, events.RunCreated, request, fields)
+        return _with_row(kind, RunRow, events.RunRequested, request, fields)
     if kind is operator.Evaluate:
         return _with_row(kind, EvaluationRow, events.EvaluationRequested, request, fields)
     made = events.WorkerRegistered if kind is worker.Register else events.Requested

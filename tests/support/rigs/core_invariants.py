@@ -68,7 +68,7 @@ def _isolation(state: State) -> None:
     for kernel in state.kernels.values():
         for index in (kernel.permits, kernel.asks, kernel.hidden, kernel.train, kernel.reservations):
             users.update({case_set: len(there) for case_set, there in index.items() if case_set is not None})
-    for case_set in state.case_sets.known():
+    for case_set in state.case_sets.known_sets():
         want("", case_set.users == users[case_set], "a case set is kept while it has users")
     for group in state.groups.values():
         run = state.runs.get(group.run)
@@ -91,7 +91,9 @@ def _jobs(state: State) -> None:
     live = 0
     ready: dict[JobState, None] = {}
     for flow in {group.flow for group in state.groups.values()}:
-        ready |= {job: None for line in flow.ready for ticket, job in line if ticket == job.ticket}
+        ready |= {
+            job: None for line in flow.ready for generation, job in line if generation == job.generation
+        }
     ends = not state.adopting or ("adopt", "") in state.timers
     want("", ends, "a job that waits for adoption has a deadline")
     for group in state.groups.values():
@@ -138,7 +140,7 @@ def _queue(state: State) -> None:
         unpinned = state.unpinned.get(flow.id) is flow
         want(flow.id, unpinned == (flow.pin is None), "a flow without a pin waits for one")
         for priority in range(N_PRIORITIES):
-            valid = [job for ticket, job in flow.ready[priority] if job.ticket == ticket]
+            valid = [job for generation, job in flow.ready[priority] if job.generation == generation]
             want(flow.id, len(valid) == flow.n_ready[priority], "ready jobs are counted")
             stray = [job for job in valid if not job.queued or job.priority != priority or job.alone]
             want(flow.id, not stray, "only queued jobs of that priority are in the queue")

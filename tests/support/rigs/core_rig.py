@@ -47,7 +47,7 @@ from evopolicy_coordinator.core.contract.records import (
 )
 from evopolicy_coordinator.core.contract.settings import CoreSettings
 from evopolicy_coordinator.core.machine import Core
-from evopolicy_coordinator.server.reason_texts import message, words
+from evopolicy_coordinator.server.reason_texts import message, reason_text
 from evopolicy_coordinator.storage.store import _PLACES, _VALUES
 from rigs.asking import asked
 from rigs.core_invariants import check_invariants
@@ -317,7 +317,7 @@ class Rig:
 
     def status(self) -> StatusReply:
         """An operator's view of the status."""
-        return self.core.status(self.now, words)
+        return self.core.status(self.now, reason_text)
 
     def row(self, kind: type[T], *key: Any) -> T:
         row = self.rows[(kind, *key)]

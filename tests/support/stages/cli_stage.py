@@ -132,7 +132,7 @@ def play(
 
         async def main() -> AgentEnded:
             async with asyncio.timeout(TIMEOUT_S):
-                playing = asyncio.create_task(make(config.harness, folder, config).play(stage))
+                playing = asyncio.create_task(make(config.harness, folder, config).run_agent(stage))
                 if over_when is not None:
                     while not playing.done() and not over_when(played):
                         await asyncio.sleep(0.05)

@@ -38,7 +38,7 @@ def play(
 
     async def main() -> AgentEnded:
         async with asyncio.timeout(TIMEOUT_S):
-            ending = await CommandHarness("command", [sys.executable, "-c", code]).play(stage)
+            ending = await CommandHarness("command", [sys.executable, "-c", code]).run_agent(stage)
             for pid in stage.started if ending.reason == "silent" else ():  # an agent supervisor would end it
                 with contextlib.suppress(ProcessLookupError):
                     os.killpg(pid, signal.SIGKILL)

@@ -17,7 +17,7 @@ from evopolicy_common.console import Terminal
 from evopolicy_common.messages.operator import ClaimState
 from evopolicy_common.messages.run_settings import RunSettings
 from evopolicy_common.records.run_record import RunRecord
-from evopolicy_common.records.suite_folder import Entry, Index
+from evopolicy_common.records.suite_folder import Index, SweepRun
 from evopolicy_common.wire.credentials import Credentials
 from evopolicy_gateway.operator.cluster import Cluster as LocalCluster
 from evopolicy_gateway.processes.child_messages import AgentDoing
@@ -26,7 +26,7 @@ from evopolicy_gateway.run_folder.layout import RunFolder
 from evopolicy_gateway.suite import runs, suite_index, sweep
 from evopolicy_gateway.suite.claimed import ClaimedSweep
 from evopolicy_gateway.suite.decisions import Facts, decide
-from evopolicy_gateway.suite.suite_file import SuiteFile, expand, read
+from evopolicy_gateway.suite.suite_file import SuiteFile, expand, read_suite
 from evopolicy_gateway.suite.suite_view import SuiteView
 
 TIMEOUT_S = 30.0
@@ -77,10 +77,10 @@ def record_of(plan: Plan) -> RunRecord:
     return record_in(plan, done)
 
 
-def entry_of(plan: Plan, **more: Any) -> Entry:
+def entry_of(plan: Plan, **more: Any) -> SweepRun:
     """In a sweep's index."""
     known = {"name": plan.name, "agent": plan.entry, "env": plan.settings.env, "digest": plan.digest}
-    return Entry(**{**known, "repeat": 0, **more})
+    return SweepRun(**{**known, "repeat": 0, **more})
 
 
 class Lifecycle:
@@ -107,7 +107,7 @@ class Stage:
     def __init__(self, root: Path, text: str, monkeypatch: pytest.MonkeyPatch, index: Index | None = None):
         path = root / "s.toml"
         path.write_text(text)
-        self.suite: SuiteFile = read(str(path))
+        self.suite: SuiteFile = read_suite(str(path))
         self.root = root / "runs"
         self.runs: list[Plan] = expand(self.suite, self.root, root)
         self.index = index or Index(suite="s")
@@ -129,7 +129,7 @@ class Stage:
         stage = self
 
         class Play(Lifecycle):
-            async def play(self, put_aside: Callable[[], None] | None = None) -> RunRecord:
+            async def play_run(self, put_aside: Callable[[], None] | None = None) -> RunRecord:
                 assert self.leaves == "all"
                 if put_aside is not None:
                     put_aside()
@@ -147,7 +147,7 @@ class Stage:
 
             async def go_on(self) -> RunRecord:
                 if self.name not in stage.attempts:
-                    return await self.play()
+                    return await self.play_run()
                 await stage.score(self.name)
                 return record_of(self.plan)
 
@@ -174,7 +174,7 @@ class Stage:
 
         async def main() -> None:
             async with asyncio.timeout(TIMEOUT_S):
-                await asyncio.gather(played.play(decided), self.beside())
+                await asyncio.gather(played.play_runs(decided), self.beside())
 
         asyncio.run(main())
         return suite_index.load(self.root, "s")
@@ -196,7 +196,7 @@ class Direct:
         self.plans = [plan_in(root, RunSettings(env=env, **names)) for env in ("toy/line", "toy/maze")]
 
         class Play(Lifecycle):
-            async def play(self, put_aside: object = None, kind: str = "play") -> RunRecord:
+            async def play_run(self, put_aside: object = None, kind: str = "play") -> RunRecord:
                 assert self.leaves == "ended"
                 assert put_aside is None
                 stage.kinds.append(kind)
@@ -207,7 +207,7 @@ class Direct:
                 return record_of(self.plan)
 
             async def go_on(self) -> RunRecord:
-                return await self.play(kind="go_on")
+                return await self.play_run(kind="go_on")
 
         @contextlib.asynccontextmanager
         async def connected(*_: object) -> AsyncIterator[tuple[object, object, None]]:
@@ -219,7 +219,7 @@ class Direct:
     def play(self, parallel: int = 1) -> runs.PlayedRuns:
         async def main() -> runs.PlayedRuns:
             async with asyncio.timeout(TIMEOUT_S):
-                return await runs.play(
+                return await runs.play_plans(
                     self.plans, LocalCluster(), parallel, Terminal(file=self.output, width=200)
                 )
 

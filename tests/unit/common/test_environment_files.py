@@ -176,12 +176,12 @@ def test_an_installed_package_adds_environments_without_being_imported(
     monkeypatch.syspath_prepend(str(tmp_path))
     catalogue.plugins.cache_clear()
     try:
-        found = catalogue.known("acme/shop")
+        found = catalogue.known_entry("acme/shop")
         assert found is not None
         assert found.gymnasium_id == "acme_shop:Shop-v0"
         (package / "environments.toml").unlink()
         catalogue.plugins.cache_clear()
         with pytest.raises(ConfigError, match="names no environment file in the package"):
-            catalogue.known("acme/shop")
+            catalogue.known_entry("acme/shop")
     finally:
         catalogue.plugins.cache_clear()

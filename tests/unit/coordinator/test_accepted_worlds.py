@@ -119,4 +119,4 @@ def test_a_damaged_journal_is_named(tmp_path: Path) -> None:
     journal = tmp_path / worlds.JOURNAL
     journal.write_text("{}\n")
     with pytest.raises(ConfigError, match="no journal of worlds"):
-        worlds.read(journal)
+        worlds.read_journal(journal)

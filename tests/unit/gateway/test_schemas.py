@@ -17,7 +17,7 @@ from invented.policies import Version
 from invented.run_dirs import write_run
 from jsonschema import Draft202012Validator
 
-from evopolicy_common.records.suite_folder import Entry, Index
+from evopolicy_common.records.suite_folder import Index, SweepRun
 from evopolicy_gateway.cli import files
 from evopolicy_gateway.suite.suite_index import save
 
@@ -38,7 +38,7 @@ def written(folder: Path) -> dict[str, Any]:
         folder,
         Index(
             suite="s",
-            runs={"a": Entry(name="a", agent="codex", env="gym/acrobot", repeat=0, digest="0" * 64)},
+            runs={"a": SweepRun(name="a", agent="codex", env="gym/acrobot", repeat=0, digest="0" * 64)},
         ),
     )
     return {

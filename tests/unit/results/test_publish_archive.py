@@ -124,18 +124,18 @@ def test_written_files_are_read_back_and_are_the_same_each_time(tmp_path: Path) 
     assert (tmp_path / "one").read_bytes() == (tmp_path / "two").read_bytes()
     with Archive(tmp_path / "one") as archive:
         assert archive.names == files.keys()
-        assert {name: archive.read(name, 100) for name in archive.names} == files
+        assert {name: archive.read_file(name, 100) for name in archive.names} == files
         with pytest.raises(ProtocolError, match="2 are allowed"):
-            archive.read("runs/0000/actions/train-000", 2)
+            archive.read_file("runs/0000/actions/train-000", 2)
         with pytest.raises(ProtocolError, match="is missing"):
-            archive.read("runs/0001/run.json", 2)
+            archive.read_file("runs/0001/run.json", 2)
 
 
 def test_changed_bytes_are_noticed_when_they_are_read(tmp_path: Path) -> None:
     path = tmp_path / "changed"
     path.write_bytes(named("abc").replace(b"abc{}", b"abc[]"))
     with Archive(path) as archive, pytest.raises(ProtocolError, match="damaged"):
-        archive.read("abc", 10)
+        archive.read_file("abc", 10)
 
 
 @given(
@@ -153,7 +153,7 @@ def test_any_damage_is_read_as_it_was_or_refused(changes: list[tuple[int, bytes]
         with contextlib.suppress(ProtocolError), Archive(Path(file.name)) as archive:
             for name in archive.names:
                 with contextlib.suppress(ProtocolError):
-                    assert archive.read(name, 100) == b"{}"
+                    assert archive.read_file(name, 100) == b"{}"
 
 
 def test_the_writer_makes_no_name_that_the_reader_refuses(tmp_path: Path) -> None:

@@ -143,7 +143,7 @@ def _track(run: Path, whole: Path) -> None:
 
 def _web(run: Path, whole: Path) -> None:
     reader = Reader([run.parents[2]])
-    for facts in reader.read(None, cluster_is_known=True).by_key.values():
+    for facts in reader.read_runs(None, cluster_is_known=True).by_key.values():
         assert facts.path is not None
         detail = Detail(facts.path)
         for submit in reader.submits(facts.path):

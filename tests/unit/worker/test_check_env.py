@@ -50,7 +50,7 @@ def test_an_idle_or_busy_environment_is_ended_with_its_processes(
     monkeypatch.setattr(conformance, "TIMEOUT_S", limit_s)
     monkeypatch.setattr(conformance, "_POLL_S", 0.05)
     monkeypatch.setattr(conformance, "_WORKS_S", 0.0)
-    monkeypatch.setattr(conformance, "play", lambda env_id, steps: play())
+    monkeypatch.setattr(conformance, "play_checked", lambda env_id, steps: play())
     monkeypatch.setattr(conformance.registry, "load", lambda env_id: None)
     (played,) = conformance.play_all(["slow"], 1)
     assert played.faults == [told]
@@ -98,7 +98,7 @@ def test_a_killed_check_leaves_no_environment() -> None:
     program = """
 import sys, time
 from evopolicy_worker.environments.checks import conformance
-conformance.play = lambda env_id, steps: (sys.__stderr__.write("plays\\n"), time.sleep(1000))
+conformance.play_checked = lambda env_id, steps: (sys.__stderr__.write("plays\\n"), time.sleep(1000))
 conformance.registry.load = lambda env_id: None
 conformance.os.dup2 = lambda old, new: None
 print(list(conformance.play_all(["slow"], 1)))
@@ -124,7 +124,7 @@ def play(env_id, steps):
     resource.setrlimit(resource.RLIMIT_NOFILE, (0, 0))
     return conformance.CheckResult(env=env_id)
 
-conformance.play = play
+conformance.play_checked = play
 conformance.registry.load = lambda env_id: None
 log = os.open(sys.argv[1], os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o600)
 try:

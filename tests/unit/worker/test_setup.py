@@ -108,7 +108,7 @@ def test_a_package_index_that_cannot_be_reached_is_reported(
         monkeypatch.setenv(f"PIP_{name}", value)
     monkeypatch.setenv("PIP_NO_CACHE_DIR", "1")
     assert "minigrid cannot be installed: ERROR: " in refused("minigrid")
-    found = installs.read(tmp_path / "installs" / "minigrid")
+    found = installs.read_made(tmp_path / "installs" / "minigrid")
     assert found is not None
     assert not found.ready
     assert installs.made() == []
@@ -161,7 +161,7 @@ def test_an_installation_is_made_anew_in_its_place(tmp_path: Path, monkeypatch: 
     done = CliRunner().invoke(cli.app, ["setup", "robotics"])
     assert done.exit_code == 0, done.output
     assert not (folder / "old").exists()
-    assert (found := installs.read(folder)) is not None
+    assert (found := installs.read_made(folder)) is not None
     assert found.ready
 
 

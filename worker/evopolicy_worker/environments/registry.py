@@ -177,7 +177,7 @@ def check_played(env_ids: Iterable[str]) -> None:
 
 
 def _known(env_id: str) -> Entry | None:
-    return _defined.get(env_id) or catalogue.known(env_id)
+    return _defined.get(env_id) or catalogue.known_entry(env_id)
 
 
 def _entry(env_id: str) -> Entry:

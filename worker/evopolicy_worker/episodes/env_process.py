@@ -27,7 +27,7 @@ from evopolicy_common.errors import (
 )
 from evopolicy_worker import environments
 from evopolicy_worker.environments.interface import calls
-from evopolicy_worker.episodes.loop import Player, fault_of
+from evopolicy_worker.episodes.loop import JobPlayer, fault_of
 from evopolicy_worker.episodes.monitor import Monitor
 from evopolicy_worker.episodes.policies import CancelledJobError, Progress
 from evopolicy_worker.sandbox import env_jail, jail
@@ -100,7 +100,7 @@ class EnvProcess:
         resource.setrlimit(resource.RLIMIT_DATA, (most, most))
         faulthandler.enable(all_threads=False)  # so that a crash names the environment's lines
         calls.current.process = os.getpid()
-        player = Player(zygote, plan, self._monitor, scratch)
+        player = JobPlayer(zygote, plan, self._monitor, scratch)
         self._hear(early)
         self._monitor.start()
         player.policies.prepare()
@@ -115,12 +115,12 @@ class EnvProcess:
             with contextlib.suppress(SandboxError, SlotDiedError):
                 player.policies.prepare()
 
-    def _play(self, player: Player, command: messages.Play, progress: Progress) -> bytes:
+    def _play(self, player: JobPlayer, command: messages.Play, progress: Progress) -> bytes:
         """Plays a job and returns its last frames, which wake the supervisor only once."""
         try:
             self._bundle = command.bundle or self._bundle
             options = (progress, self._channel.send_frame, command.first, command.failure)
-            last = player.play(command.job, self._bundle, *options)
+            last = player.play_job(command.job, self._bundle, *options)
             progress.give_up(None)
             if len(last) > MOST_JOINED_BYTES:
                 self._channel.send_frame(last)
@@ -135,7 +135,7 @@ class EnvProcess:
             self._progress = None
             self._monitor.ticking = False
 
-    def _described(self, player: Player, env_ids: tuple[str, ...]) -> messages.Reply:
+    def _described(self, player: JobPlayer, env_ids: tuple[str, ...]) -> messages.Reply:
         self._monitor.ticking = True
         self._monitor.wake()
         try:

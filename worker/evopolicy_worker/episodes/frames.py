@@ -2,7 +2,7 @@
 
 Rules: a request is written in one piece, and the reply is exactly one frame. Replies are hostile: they are bounded,
 parsed as plain values and arrays, and never executed; any other bytes raise BadReplyError. The other end,
-`sandbox/inside/player.py`, defines the numbers.
+`sandbox/inside/policy_server.py`, defines the numbers.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from evopolicy_common.errors import DECODE_ERRORS, WorkerError
 from evopolicy_common.messages.environment import SpaceSchema
 from evopolicy_worker.environments.interface.actions import MAX_ITEMS
 from evopolicy_worker.environments.interface.spaces import VARYING, array_of, parts
-from evopolicy_worker.sandbox.inside.player import (
+from evopolicy_worker.sandbox.inside.policy_server import (
     ARRAY,
     FLOAT,
     FLOATS,

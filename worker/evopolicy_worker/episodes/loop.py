@@ -9,15 +9,32 @@ Rules:
 - When a recording is replayed, its actions replace the policy's, up to its last step. The episode then stops, even if
   the environment did not end it.
 - Between a policy's calls the same work is done in every split, since a policy can measure the time: each step goes to
-  both recorders, although hidden episodes keep only the actions. Pictures are compressed after the end as far as memory
-  allows (`rendered.HELD_BYTES`).
+  both recorders, although hidden episodes keep only the actions. `_Course` owns the recordings and this balance.
+  Pictures are compressed after the end as far as memory allows (`rendered.HELD_BYTES`).
 - A video is made from the episode's actions after the job's last policy has ended (see `video.py`); the episode itself
   never renders, and no policy waits for a video.
-- A policy's failure is a result, and so is the effect of its actions on the environment: if an environment breaks down
-  on them, the episode is repeated once with random actions only. Other failures of environment or sandbox are raised.
-- A policy that was ended from outside is restarted together with its episode, and so is a hidden episode whose job was
-  returned. The actions that it returned remain valid, and so does its failure: no policy gets a second attempt. An
-  environment that is not deterministic would answer them with another episode, so there the episode starts over.
+- A policy's failure is a result, and so is the effect of its actions on the environment. Other failures of environment
+  or sandbox are raised.
+- An episode is repeated in `JobPlayer._play` alone. The actions that the policy returned remain valid, and so does its
+  failure: no policy gets a second attempt. An environment that is not deterministic would answer them with another
+  episode, so there the episode starts over.
+
+An attempt at an episode, by where its actions come from (`_Episode._source`):
+
+| state | event | next |
+|---|---|---|
+| begin | the policy is loaded and reset | asked |
+| | the policy fails | random; ended if it is the submit's verdict, or with "end-submit" |
+| | no bundle, or an earlier attempt's policy has failed | random, after the actions that were returned |
+| | a recording is given | recorded |
+| asked | the policy returns an action; those of an earlier attempt are played in its place | asked |
+| | the policy fails | random, from this step on |
+| asked, recorded, random | the environment ends, the step limit, or the last recorded step | ended |
+| random | "end-submit": after one action | ended |
+| any | the job is cancelled | CancelledJobError |
+| any | the policy's process is ended from outside | begin, at most `MAX_ENDS` times; raised with scope "submit" |
+| any, the policy has acted | the environment breaks down | begin, all actions random, the policy has failed |
+| any, it has not | the environment breaks down | raised |
 """
 
 from __future__ import annotations
@@ -71,7 +88,7 @@ from evopolicy_worker.episodes.monitor import Monitor
 from evopolicy_worker.episodes.policies import CancelledJobError, Policies, Progress
 from evopolicy_worker.episodes.policy_process import PolicyFailedError, PolicyProcess
 from evopolicy_worker.episodes.video import VideoRecorder
-from evopolicy_worker.sandbox.inside.player import reset_floats
+from evopolicy_worker.sandbox.inside.policy_server import reset_floats
 from evopolicy_worker.sandbox.jail import Jail
 from evopolicy_worker.sandbox.zygote import Zygote
 from evopolicy_worker.slot_protocol import endings
@@ -98,7 +115,7 @@ _ACTING = messages.framed(messages.Acting())
 _Tell = Callable[[bytes], None]
 
 
-class Player:
+class JobPlayer:
     """Plays jobs one after another with warm environments and a zygote."""
 
     def __init__(self, zygote: Zygote, jail: Jail, monitor: Monitor, scratch: Path) -> None:
@@ -107,7 +124,7 @@ class Player:
         self._videos = VideoRecorder()
         self._log = Log(scratch)
 
-    def play(
+    def play_job(
         self,
         job: Job,
         files: messages.Files | None,
@@ -179,20 +196,13 @@ class Player:
     def _play(
         self, k: int, job: Job, progress: Progress, tell: _Tell, begun: Begun
     ) -> tuple[EpisodeOutcome, bytes, bytes]:
-        """The outcome of one episode, which continues from `begun`; the same framed; its log of actions."""
+        """As `_Episode.play_episode`, from `begun` on; repeated after ends that are not the episode's own."""
         n_ends = 0
         while True:
             environment = self._environment(job.env)
             episode = _Episode(job, k, job.episodes[k], environment, self.policies, progress, tell, begun)
             try:
-                outcome, log, unused = episode.play()
-                kept = None
-                if len(job.episodes) > 1 and (is_kept(job) or (job.bundle and job.policy_scope == "submit")):
-                    # In every split, as a policy of several episodes can measure the pause between them.
-                    packed = begun.packed()
-                    kept = packed if is_kept(job) else None
-                finished = messages.Finished(outcome=_brief(outcome, _share(job)), begun=kept, unused=unused)
-                return outcome, messages.framed(finished), log
+                return episode.play_episode()
             except EndedFromOutsideError as error:
                 # Where one policy plays several episodes it took with it what it had learned.
                 n_ends += 1
@@ -246,8 +256,20 @@ class _Episode:
     acted: bool = False
     """Whether an action of the policy's has reached the environment."""
 
-    def play(self) -> tuple[EpisodeOutcome, bytes, bytes]:
-        """The outcome, without a video, the log of actions if it was kept, and feedback that nobody may read."""
+    def play_episode(self) -> tuple[EpisodeOutcome, bytes, bytes]:
+        """The outcome, without a video; the same as a framed `Finished`; the log of actions if it was kept."""
+        job, begun = self.job, self.begun
+        outcome, log, unused = self._outcome()
+        kept = None
+        if len(job.episodes) > 1 and (is_kept(job) or (job.bundle and job.policy_scope == "submit")):
+            # In every split, as a policy of several episodes can measure the pause between them.
+            packed = begun.packed()
+            kept = packed if is_kept(job) else None
+        finished = messages.Finished(outcome=_brief(outcome, _share(job)), begun=kept, unused=unused)
+        return outcome, messages.framed(finished), log
+
+    def _outcome(self) -> tuple[EpisodeOutcome, bytes, bytes]:
+        """The outcome, the log of actions, and feedback that nobody may read."""
         job, spec, begun = self.job, self.spec, self.begun
         start = time.monotonic()
         recorded: list[Returned] | None = None
@@ -277,11 +299,7 @@ class _Episode:
         )
         if unplayed:
             return outcome, b"", b""
-        # A policy of several episodes can measure the pause between them, in which feedback is made and sent.
-        pauses = job.policy_scope == "submit"
-        full, actions = course.full, course.actions
-        rows = full.finish() if full and (pauses or job.record == "full") else b""
-        log = actions.finish() if actions and (pauses or job.record != "full" or job.video) else b""
+        rows, log = course.finish(job)
         feedback, kept = _blob(rows), _blob(log)
         # An agent's feedback has only the success that the environment's description names.
         told = job.record != "full" or self.environment.description.success
@@ -296,7 +314,7 @@ class _Episode:
     def _begin(self) -> PolicyProcess | None:
         """The policy, told of the new episode; None, with the failure noted, when it failed before its first act."""
         try:
-            policy = self.policies.take(self.k, self.spec)
+            policy = self.policies.take_policy(self.k, self.spec)
             policy.reset(self.spec.episode_index)
             return policy
         except PolicyFailedError as error:
@@ -399,6 +417,14 @@ class _Course:
         self.terminated, self.truncated = terminated, truncated
         return terminated or truncated or length == self._n_recorded or mark == self._last_mark
 
+    def finish(self, job: Job) -> tuple[bytes, bytes]:
+        """The recordings of everything and of the actions; empty where nobody needs one."""
+        # A policy of several episodes can measure the pause between them, in which feedback is made and sent.
+        pauses = job.policy_scope == "submit"
+        rows = self.full.finish() if self.full and (pauses or job.record == "full") else b""
+        log = self.actions.finish() if self.actions and (pauses or job.record != "full" or job.video) else b""
+        return rows, log
+
 
 def _replayed(codec: ActionCodec, actions: Sequence[Returned], then: Source | None = None) -> Source:
     """Actions of an earlier attempt or a recording; after the last, those of `then`."""
@@ -415,7 +441,7 @@ def _replayed(codec: ActionCodec, actions: Sequence[Returned], then: Source | No
 def _asked(codec: ActionCodec, policy: PolicyProcess, begun: Begun) -> Source:
     """A policy's actions, which are added to `begun`. Raises PolicyFailedError."""
     earlier, n_earlier = _replayed(codec, begun.taken), len(begun.taken)
-    ask, repair, take = policy.act, codec.repair, begun.take
+    ask, repair, take = policy.act, codec.repair, begun.add_action
 
     def act(t: int, obs: Observation) -> tuple[Any, Any, str]:
         returned = ask(obs)

@@ -69,7 +69,7 @@ class Output:
                 self.open = bool(data)
                 self._kept += data[: self._limit - len(self._kept)]
 
-    def take(self) -> bytes:
+    def take_output(self) -> bytes:
         """Returns the stored output and clears it."""
         kept, self._kept = bytes(self._kept), bytearray()
         return kept

@@ -117,7 +117,7 @@ class Policies:
         elif description.reward_components:
             self._env_meta["reward_components"] = dict(description.reward_texts)
 
-    def take(self, k: int, spec: EpisodeSpec) -> PolicyProcess:
+    def take_policy(self, k: int, spec: EpisodeSpec) -> PolicyProcess:
         """The policy for the job's k-th episode, before its reset. Raises PolicyFailedError."""
         job, files = self._job, self._files
         assert files is not None

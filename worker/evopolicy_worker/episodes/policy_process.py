@@ -26,7 +26,7 @@ from evopolicy_common.processes.packages import SIMULATORS
 from evopolicy_worker.episodes import frames
 from evopolicy_worker.episodes.monitor import STOPPED_S, Monitor, Verdict, Watch
 from evopolicy_worker.sandbox import zygote as zygotes
-from evopolicy_worker.sandbox.inside import player
+from evopolicy_worker.sandbox.inside import policy_server
 from evopolicy_worker.sandbox.jail import Jail
 from evopolicy_worker.sandbox.zygote import Child, Exit, Zygote, wait_dead
 from evopolicy_worker.slot_protocol import endings
@@ -146,7 +146,7 @@ class PolicyProcess:
         """
         self.seal(messages.Files([("policy.py", False, len(source))], source), bytes(16), env_meta, "arrays")
         try:
-            return self._request(player.COMPILE, "init", self._limits.init_wall_s)
+            return self._request(policy_server.COMPILE, "init", self._limits.init_wall_s)
         except PolicyFailedError:
             # The process that plays finds and reports it again.
             return b""
@@ -157,7 +157,7 @@ class PolicyProcess:
         Raises PolicyFailedError with a category of NO_POLICY.
         """
         self._watch.spent_s = 0.0
-        self._request(player.LOAD, "init", self._limits.init_wall_s, 0, code)
+        self._request(policy_server.LOAD, "init", self._limits.init_wall_s, 0, code)
 
     def seal(
         self,
@@ -204,7 +204,7 @@ class PolicyProcess:
         self._write = frames.compile_writer(obs_space)
         self._monitor.watch(self._watch)
         head = json.dumps(init).encode()
-        self._request(player.INIT, "seal", _SEAL_S, len(head), head, bundle.data)
+        self._request(policy_server.INIT, "seal", _SEAL_S, len(head), head, bundle.data)
 
     def begin_episode(self) -> None:
         """Wall, CPU time and output count from here; the first episode's include the import."""
@@ -213,7 +213,7 @@ class PolicyProcess:
     def reset(self, episode_index: int) -> None:
         """Raises PolicyFailedError."""
         self._surplus_bytes = 0
-        self._request(player.RESET, "reset", self._limits.act_wall_s, episode_index)
+        self._request(policy_server.RESET, "reset", self._limits.act_wall_s, episode_index)
         # Here for all steps of the episode, which have the same limit.
         self._watch.what = "act"
 
@@ -224,9 +224,9 @@ class PolicyProcess:
         for part in parts:
             length += part.nbytes if type(part) is not bytes else len(part)
         tag, payload = self._exchange(
-            [player.REQUEST_HEADER.pack(length, player.ACT, 0), *parts], 16 + length
+            [policy_server.REQUEST_HEADER.pack(length, policy_server.ACT, 0), *parts], 16 + length
         )
-        if tag <= player.GENERIC:
+        if tag <= policy_server.GENERIC:
             if len(payload) > self._action_bytes + _ARRAY_HEAD_BYTES:
                 how = f"it sent an action of {len(payload):,} bytes; {self._action_bytes:,} are the limit"
                 raise self._broken(how, self._action_bytes, len(payload))
@@ -240,7 +240,7 @@ class PolicyProcess:
                     )
                     raise self._failed("act_error", f"{text} {limit:,} are the limit", "", limit, used)
             try:
-                return frames.action(tag, payload, self._action_bytes // player.VALUE_BYTES)
+                return frames.action(tag, payload, self._action_bytes // policy_server.VALUE_BYTES)
             except frames.BadReplyError as error:
                 raise self._broken(str(error)) from None
         raise self._reported_failure(tag, payload, "act")
@@ -252,7 +252,7 @@ class PolicyProcess:
         """
         if not self.dead:
             with contextlib.suppress(PolicyFailedError):
-                self._request(player.FLUSH, "act", _GRACE_S)
+                self._request(policy_server.FLUSH, "act", _GRACE_S)
         if self.dead:
             return self.end()
         ended = self._output(self._watch.cpu_s() - self._watch.cpu_start_s)
@@ -263,14 +263,14 @@ class PolicyProcess:
         # From here on no other thread reads it.
         self._monitor.watch(None)
         self._watch.drain()
-        return Ended(self._watch.stdout.take(), self._watch.stderr.take(), cpu_s)
+        return Ended(self._watch.stdout.take_output(), self._watch.stderr.take_output(), cpu_s)
 
     def end(self) -> Ended:
         """End the process, if it has not ended, and collect what it leaves."""
         if self._finished is None:
             if not self.dead:
                 with contextlib.suppress(PolicyFailedError, EndedFromOutsideError):
-                    self._request(player.END, "act", _GRACE_S)
+                    self._request(policy_server.END, "act", _GRACE_S)
             alive_s = max(0.0, self._watch.cpu_s() - self._watch.cpu_start_s)
             self._finished = self._output(self._cpu_of_episode() if self.dead else alive_s)
             with self._closing:
@@ -293,9 +293,9 @@ class PolicyProcess:
         """The answer to a request that succeeds. Raises PolicyFailedError."""
         self._watch.what, self._watch.answer_limit_s = stage, limit_s
         length = sum(map(len, payload))
-        header = player.REQUEST_HEADER.pack(length, kind, argument)
+        header = policy_server.REQUEST_HEADER.pack(length, kind, argument)
         tag, answer = self._exchange([header, *payload], 16 + length)
-        if tag != player.OK:
+        if tag != policy_server.OK:
             raise self._reported_failure(tag, answer, stage)
         return answer
 
@@ -312,7 +312,7 @@ class PolicyProcess:
             data = b""
         if len(data) < 8:
             data = self._read_more(data, 8)
-        length, tag = player.REPLY_HEADER.unpack_from(data)
+        length, tag = policy_server.REPLY_HEADER.unpack_from(data)
         if len(data) != 8 + length:
             if length > frames.MAX_REPLY_BYTES:
                 how = f"it announced an answer of {length:,} bytes; {frames.MAX_REPLY_BYTES:,} are the limit"
@@ -350,7 +350,7 @@ class PolicyProcess:
             raise SandboxError(
                 f"a policy's process could not seal itself: {payload.decode('utf-8', 'replace')}"
             )
-        if tag != player.FAILED:
+        if tag != policy_server.FAILED:
             return self._broken(f"it answered {asked} with frame {tag}")
         try:
             report = frames.report(payload)

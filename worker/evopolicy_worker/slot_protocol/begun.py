@@ -50,7 +50,7 @@ class Begun:
         self.failure = failure
         self.log: Log | None = None
 
-    def take(self, each: Returned) -> None:
+    def add_action(self, each: Returned) -> None:
         """Adds an action, before it reaches the environment."""
         self.taken.append(each)
         if self.log is not None:

@@ -3,10 +3,23 @@
 Rules:
 - A job's failure is its policy's (an outcome) or an infrastructure failure (WorkerError, SandboxError, SlotDiedError:
   the job is played elsewhere), as the table in `endings` decides.
-- If the environment's process crashes on a policy's actions, or hangs on them as in earlier attempts, a new process
-  plays the episode with random actions, and then the rest of the job.
+- A crash on a policy's actions is its failure: random actions play that episode, and the policy the rest of the job.
 - If the process ends otherwise, the actions that the policy had returned are read from the scratch folder.
-- After `cancel` the slot is usable. After an error `start` restarts it.
+
+| state | event | next |
+|---|---|---|
+| closed | `start` | ready; closed, with SandboxError or WorkerError |
+| ready | `play` | playing; in a new process if this one may remember a hidden episode, or cannot draw |
+| | `describe` | ready; its process has ended or is killed, with BrokenEnvironmentError or SlotDiedError |
+| playing | `Progress`, `Acting`, `Finished`, `Begun`, `Filmed` | playing |
+| | `Played` | ready, with the outcomes; without any after `cancel` |
+| | `Fault` | ready, with its error |
+| | the environment ends, breaks down or hangs on a policy's actions | playing, in a new process |
+| | the process ends otherwise | ended, with SlotDiedError or BrokenEnvironmentError |
+| | `cancel`, and no answer for `CANCEL_TIMEOUT_S` | ended |
+| | the task of `play` is cancelled | ended |
+| ended | `start` | as from closed |
+| any | `close` | closed; its scratch folder is removed |
 """
 
 from __future__ import annotations
@@ -167,7 +180,7 @@ class Slot:
         if env_ids:
             await self.describe(env_ids)
 
-    async def play(
+    async def play_job(
         self, job: Job, bundle: Path | None, on_progress: Callable[[int, int], None]
     ) -> tuple[EpisodeOutcome, ...]:
         """Plays a job and returns an outcome for each of its episodes, in order, with trajectories inline.

@@ -84,7 +84,7 @@ async def play_turn(api: Conversation, prompt: str, session: Session, events: Ev
     last: tuple[str, str] | None = None
     while True:
         try:
-            reply = await api.ask()
+            reply = await api.ask_model()
         except ApiError as failure:
             if failure.too_long and api.shorten():
                 continue

@@ -141,7 +141,7 @@ class Conversation:
         system: list[ModelRequestPart] = [] if self.messages else [SystemPromptPart(self._system)]
         self.messages.append(ModelRequest([*system, UserPromptPart(text)]))
 
-    async def ask(self) -> Reply:
+    async def ask_model(self) -> Reply:
         """The model's answer, which is added to the messages. Raises ApiError."""
         try:
             with warnings.catch_warnings(action="ignore"):

@@ -63,9 +63,9 @@ class AcpAgent(CliAgent):
         self._acp = dialect
         self._link: _Link | None = None
 
-    async def play(self, stage: Stage) -> AgentEnded:
+    async def run_agent(self, stage: Stage) -> AgentEnded:
         try:
-            return await super().play(stage)
+            return await super().run_agent(stage)
         finally:
             await self._hang_up(stage)
 
@@ -210,7 +210,7 @@ class AcpAgent(CliAgent):
 
     def _read(self, stage: Stage, reader: AcpReader, event: dict[str, Any]) -> None:
         before = reader.action
-        reader.read(event)
+        reader.read_event(event)
         for entry in reader.entries():
             stage.log.note(entry)
         if reader.action != before:

@@ -73,7 +73,7 @@ class AcpReader(TurnReader):
         self._calls: dict[str, dict[str, Any]] = {}
         """Tool calls without a result, by their ids."""
 
-    def read(self, event: Mapping[str, Any]) -> None:
+    def read_event(self, event: Mapping[str, Any]) -> None:
         """A `session/update`."""
         kind, content = event.get("sessionUpdate"), mapping(event.get("content"))
         if kind == "agent_message_chunk":

@@ -93,7 +93,7 @@ class ClaudeReader(TurnReader):
         super().__init__()
         self._messages: dict[str, Usage] = {}
 
-    def read(self, event: Mapping[str, Any]) -> None:
+    def read_event(self, event: Mapping[str, Any]) -> None:
         kind = event.get("type")
         if kind == "system" and event.get("subtype") == "init":
             self.session = string(event.get("session_id")) or None

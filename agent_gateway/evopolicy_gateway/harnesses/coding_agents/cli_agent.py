@@ -77,13 +77,13 @@ class CliAgent(Harness):
         """Turns in a row that ended by faulty answers."""
         self._pause_s = self._config.pause_s
 
-    def take(self, kept: Kept) -> None:
+    def take_inputs(self, kept: Kept) -> None:
         self._dialect.kept = kept
 
     def check(self, env: str) -> None:
         self._check_program(os.environ | self._dialect.environment() | self._config.environment, ConfigError)
 
-    async def play(self, stage: Stage) -> AgentEnded:
+    async def run_agent(self, stage: Stage) -> AgentEnded:
         self._config.check(stage.environment)
         own = self._dialect.environment() | self._config.environment
         stage = msgspec.structs.replace(stage, environment={**stage.environment, **own})
@@ -136,7 +136,7 @@ class CliAgent(Harness):
 
         await self._play_turn(stage, begun, prompt, reader, capped)
         known = reader.session or begun
-        state.take(known or "", reader.usage, cumulative=dialect.cumulative)
+        state.add_usage(known or "", reader.usage, cumulative=dialect.cumulative)
         if known is not None and (reader.session is not None or reader.done):
             state.session = known
         state.requests_failed += reader.requests_failed
@@ -298,7 +298,7 @@ class CliAgent(Harness):
         except (OSError, subprocess.TimeoutExpired) as error:
             raise AgentError(f"{self._program[0]} does not answer {' '.join(arguments)}: {error}") from error
 
-    def known(self) -> dict[str, Any]:
+    def known_facts(self) -> dict[str, Any]:
         settings = self._config.settings() | {"program": self._program}
         return {"harness": self.name, "model_string": self._config.model, "settings": settings}
 
@@ -306,7 +306,7 @@ class CliAgent(Harness):
         self, reason: Literal["agent_stopped", "agent_failed"] = "agent_stopped", detail: str = ""
     ) -> AgentEnded:
         state, config = self._state, self._config
-        facts = self.known() | {"cli_version": self._version}
+        facts = self.known_facts() | {"cli_version": self._version}
         facts["settings"] |= {"reprompted": state.reprompts, "paused_s": round(state.paused_s, 1)}
         facts["settings"]["requests_failed"] = state.requests_failed
         if self._dialect.tested_version not in ("", self._version):

@@ -78,7 +78,7 @@ class Codex(Dialect):
 
 
 class CodexReader(TurnReader):
-    def read(self, event: Mapping[str, Any]) -> None:
+    def read_event(self, event: Mapping[str, Any]) -> None:
         kind = event.get("type")
         if kind == "thread.started":
             self.session = string(event.get("thread_id")) or None

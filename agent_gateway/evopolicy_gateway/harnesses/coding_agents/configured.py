@@ -79,7 +79,7 @@ class ConfiguredReader(TurnReader):
         super().__init__()
         self._events = events
 
-    def read(self, event: Mapping[str, Any]) -> None:
+    def read_event(self, event: Mapping[str, Any]) -> None:
         self.session = _first(event, self._events.session) or self.session
         if text := _first(event, self._events.text):
             self.text, self.action = text, first_line(text)

@@ -43,7 +43,7 @@ class TurnReader(ABC):
         """Number of retries by the CLI itself."""
 
     @abstractmethod
-    def read(self, event: Mapping[str, Any]) -> None:
+    def read_event(self, event: Mapping[str, Any]) -> None:
         """Processes the next event; ignores unknown events."""
 
 

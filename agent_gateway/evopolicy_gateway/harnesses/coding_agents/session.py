@@ -38,7 +38,7 @@ class SessionState(msgspec.Struct, kw_only=True):
         """Token use of all sessions except this one."""
         return sum((usage for known, usage in self.used.items() if known != session), Usage())
 
-    def take(self, session: str, usage: Usage, *, cumulative: bool) -> None:
+    def add_usage(self, session: str, usage: Usage, *, cumulative: bool) -> None:
         """Records the usage of a finished turn."""
         if cumulative:
             # A failed turn may report no usage, which must not reset its session's count.

@@ -89,7 +89,7 @@ async def _read(
         except orjson.JSONDecodeError:
             continue
         before = reader.action
-        reader.read(event)
+        reader.read_event(event)
         if reader.action != before:
             stage.on_doing(AgentDoing(action=stage.log.redact.text(reader.action)))
         if (why_capped := capped(reader)) is not None:

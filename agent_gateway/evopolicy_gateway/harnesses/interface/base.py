@@ -118,7 +118,7 @@ class Harness(ABC):
     continues = False
     """Whether its program continues by itself from its workspace when it is started again, without a session."""
 
-    def take(self, kept: Kept) -> None:
+    def take_inputs(self, kept: Kept) -> None:
         """Gives it the run's skills and MCP servers, before it plays."""
         assert not kept, "only agents with settings have inputs"
 
@@ -127,7 +127,7 @@ class Harness(ABC):
     relay: RelayAddress | None = None
     """Where the agent finds its model; None: at the provider, with the operator's key."""
 
-    def known(self) -> dict[str, Any]:
+    def known_facts(self) -> dict[str, Any]:
         """Facts for `run.json` that do not depend on the agent's end, in case its supervisor cannot report the
         others."""
         return {}
@@ -136,7 +136,7 @@ class Harness(ABC):
         """Raises ConfigError when the agent cannot play `env` on this machine; call it before a run is opened."""
 
     @abstractmethod
-    async def play(self, stage: Stage) -> AgentEnded:
+    async def run_agent(self, stage: Stage) -> AgentEnded:
         """Runs the agent until it stops by itself. Cancelled when the run ends for another reason."""
 
 

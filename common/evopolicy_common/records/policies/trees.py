@@ -83,7 +83,7 @@ def name_of(folder: Path, index: int) -> str:
 def changes(folder: Path, index: int) -> str:
     """In words, the files outside `system/` that changed since the submit before; may be empty."""
     try:
-        trees = [read(folder, name_of(folder, n))[0] for n in (index - 1, index) if n >= 0]
+        trees = [read_tree(folder, name_of(folder, n))[0] for n in (index - 1, index) if n >= 0]
     except ConfigError:
         return ""
     old, new = ({file.path: file.blob for file in tree.files} for tree in [Tree(files=()), *trees][-2:])
@@ -106,7 +106,7 @@ def submit_number(name: str) -> int | None:
     return int(name.partition("_")[2]) if _SUBMIT.fullmatch(name) else None
 
 
-def read(folder: Path, submit: str) -> tuple[Tree, str]:
+def read_tree(folder: Path, submit: str) -> tuple[Tree, str]:
     """A tree of the run at `folder`, and its digest. Raises ConfigError for a missing or damaged one."""
     path = folder / TREES / f"{submit}.json"
     try:
@@ -136,7 +136,7 @@ def restore(folder: Path, tree: Tree, workspace: Path) -> None:
         try:
             if blobs.size(file.blob) != file.size:
                 raise ValueError(f"its content has not {file.size:,} bytes")
-            data = blobs.read(file.blob)
+            data = blobs.read_blob(file.blob)
             write_new(workspace / file.path, data, 0o755 if file.executable else 0o644)
         except (OSError, ValueError, StorageError) as error:
             raise StorageError(f"cannot restore {file.path}: {error}") from error

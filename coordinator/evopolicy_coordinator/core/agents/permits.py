@@ -20,7 +20,7 @@ from evopolicy_coordinator.core.contract.reasons import Reason
 from evopolicy_coordinator.core.contract.records import PermitRow, RunRow, RunStateRow
 from evopolicy_coordinator.core.isolation import conflicts
 from evopolicy_coordinator.core.isolation.conflicts import put
-from evopolicy_coordinator.core.structures import take
+from evopolicy_coordinator.core.structures import pop_entry
 from evopolicy_coordinator.core.tables.model import Ask, CaseSet, Kernel, Run
 from evopolicy_coordinator.core.tables.state import State
 from evopolicy_coordinator.core.tables.step import Step
@@ -35,13 +35,13 @@ def place(run: Run, boot_id: str) -> str | None:
     return None if declared == ELSEWHERE else (declared or boot_id)
 
 
-def held(state: State, run: str) -> list[tuple[Kernel, PermitRow]]:
+def permits_of_run(state: State, run: str) -> list[tuple[Kernel, PermitRow]]:
     return [(kernel, row) for kernel, (row, _) in state.permits.get(run, {}).items()]
 
 
 def places(state: State, run: str) -> set[str]:
     """Boot ids of the kernels on which a run has or requests a permit."""
-    return {kernel.boot_id for kernel, _ in held(state, run)} | {
+    return {kernel.boot_id for kernel, _ in permits_of_run(state, run)} | {
         boot_id for name, boot_id in state.asks if name == run
     }
 
@@ -49,7 +49,7 @@ def places(state: State, run: str) -> set[str]:
 # ---- requests ----
 
 
-def ask(state: State, run: Run, row: PermitRow, step: Step) -> Reason | None:
+def ask_permit(state: State, run: Run, row: PermitRow, step: Step) -> Reason | None:
     """Request a permit, again or for the first time. Returns the reason that it waits for; None when it is granted."""
     kernel, case_set = conflicts.kernel(state, row.boot_id), run.case_set
     if run.id in kernel.permits.get(case_set, ()):
@@ -84,7 +84,7 @@ def restore(state: State, row: PermitRow, case_set: CaseSet) -> None:
 
 
 def _withdraw(state: State, run: str, kernel: Kernel, case_set: CaseSet) -> Ask | None:
-    ask = take(kernel.asks, case_set, run)
+    ask = pop_entry(kernel.asks, case_set, run)
     state.asks.pop((run, kernel.boot_id), None)
     if ask is not None:
         state.timers.disarm(("ask", (run, kernel.boot_id)))
@@ -127,17 +127,17 @@ def drop_asks(state: State, run: str, reason: Reason, step: Step) -> None:
 def end(state: State, run: str, step: Step, why: str, *, boot_id: str = "") -> None:
     """End the permits of a run whose agent is gone, from one kernel or (`boot_id` empty) from all. Its permit for an
     unknown kernel ends in both cases."""
-    for kernel, row in held(state, run):
+    for kernel, row in permits_of_run(state, run):
         if boot_id in ("", kernel.boot_id) or kernel is state.everywhere:
             _end(state, kernel, row, step, why)
-    if not held(state, run):
+    if not permits_of_run(state, run):
         state.timers.disarm(("cancelled", run))
 
 
 def _end(state: State, kernel: Kernel, row: PermitRow, step: Step, why: str) -> None:
     _, case_set = state.permits[row.run][kernel]
-    take(state.permits, row.run, kernel)
-    take(kernel.permits, case_set, row.run)
+    pop_entry(state.permits, row.run, kernel)
+    pop_entry(kernel.permits, case_set, row.run)
     step.persist(msgspec.structs.replace(row, ended_at=step.now))
     step.log("info", "permit_ended", run=row.run, host=row.host, boot_id=row.boot_id, why=why)
     conflicts.freed(state, case_set, step)
@@ -152,7 +152,7 @@ def agent_ended(state: State, run: str, step: Step) -> None:
 
 def cancelled(state: State, run: str, step: Step, at: float | None = None) -> None:
     """Set the deadline after which the permits of a cancelled run end; its agent is being ended."""
-    if held(state, run):
+    if permits_of_run(state, run):
         state.timers.arm(("cancelled", run), (step.now if at is None else at) + CANCELLED_S)
 
 
@@ -182,7 +182,7 @@ def load(
 
 def agents(state: State, run: str) -> str:
     """The place of a run's agent, in words; empty for nowhere."""
-    return ", ".join(sorted(row.host or row.boot_id or "everywhere" for _, row in held(state, run)))
+    return ", ".join(sorted(row.host or row.boot_id or "everywhere" for _, row in permits_of_run(state, run)))
 
 
 def poll_target(run: str, boot_id: str) -> str:

@@ -22,7 +22,7 @@ from evopolicy_coordinator.core.contract.records import submit_group
 from evopolicy_coordinator.core.isolation import conflicts
 from evopolicy_coordinator.core.isolation.conflicts import all_related
 from evopolicy_coordinator.core.leasing import leases
-from evopolicy_coordinator.core.structures import take
+from evopolicy_coordinator.core.structures import pop_entry
 from evopolicy_coordinator.core.tables.model import (
     HIDDEN,
     TRAIN,
@@ -125,7 +125,7 @@ def _release(state: State, reservation: Reservation, step: Step, why: str) -> No
     """Release a reserved kernel: agents have precedence again."""
     kernel, case_set, lane = reservation.kernel, reservation.case_set, reservation.lane
     del lane.reservations[case_set]
-    take(kernel.reservations, case_set, str(lane.key))
+    pop_entry(kernel.reservations, case_set, str(lane.key))
     step.log("info", "agents_first", env=lane.key[0], boot_id=kernel.boot_id, why=why)
     conflicts.freed(state, case_set, step)
     conflicts.tidy(state, kernel)

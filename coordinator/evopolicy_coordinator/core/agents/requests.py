@@ -29,7 +29,7 @@ def live(state: State, name: str) -> Run:
     return run
 
 
-def known(state: State, name: str) -> Run | None:
+def known_run(state: State, name: str) -> Run | None:
     """Returns the run of that name; None for a finished one. Raises NotDoneError for an unknown one."""
     if name not in state.capabilities:
         raise NotDoneError("unknown_run", run=name)
@@ -71,7 +71,7 @@ def requested(state: State, event: events.Requested[gateway.RequestPermit], step
     if kernel not in places and len(places) >= MAX_PLACES:
         raise NotDoneError("too_many_places", run=run.id, n=MAX_PLACES)
     row = PermitRow(run=run.id, boot_id=kernel, host=message.host if kernel == message.boot_id else "")
-    waits_for = permits.ask(state, run, row, step)
+    waits_for = permits.ask_permit(state, run, row, step)
     if waits_for is None:
         step.reply(event.request, gateway.Permit(granted=True))
         return
@@ -99,9 +99,9 @@ def _implied(state: State, run: Run, step: Step) -> Reason | None:
     """Request the permit for any kernel for a run whose gateway requests none. Returns the reason that it waits for;
     None when the run has a permit or needs none."""
     kernel = permits.place(run, EVERYWHERE)
-    if kernel is None or permits.held(state, run.id):
+    if kernel is None or permits.permits_of_run(state, run.id):
         return None
-    waits_for = permits.ask(state, run, PermitRow(run=run.id, boot_id=kernel), step)
+    waits_for = permits.ask_permit(state, run, PermitRow(run=run.id, boot_id=kernel), step)
     if waits_for is not None:
         state.timers.arm(("ask", (run.id, kernel)), step.now + ASK_AGAIN_S)
     return waits_for
@@ -110,7 +110,7 @@ def _implied(state: State, run: Run, step: Step) -> Reason | None:
 def agent_gone(state: State, event: events.Requested[operator.AgentGone], step: Step) -> None:
     """An operator confirms that a run's agent is no longer alive."""
     message = event.message
-    known(state, message.run)
+    known_run(state, message.run)
     permits.end(state, message.run, step, "by an operator's command", boot_id=message.boot_id)
     step.reply(event.request, operator.Done())
 
@@ -126,7 +126,7 @@ def resume(state: State, run: Run, step: Step) -> None:
     """Restore the isolation and permits of an unfinished run in a core that was just loaded."""
     before = run.state.isolation
     if before == "unknown":
-        if run.state.phase == "open" and not permits.held(state, run.id):
+        if run.state.phase == "open" and not permits.permits_of_run(state, run.id):
             # Its gateway so far requested no permit.
             kernel = permits.place(run, EVERYWHERE)
             if kernel is not None:

@@ -39,7 +39,7 @@ class Requested(Event, Generic[M_co], frozen=True, kw_only=True):
     """Seconds for which the request lay unread because the loop was blocked."""
 
 
-class RunCreated(Requested[CreateRun], frozen=True, kw_only=True):
+class RunRequested(Requested[CreateRun], frozen=True, kw_only=True):
     """An operator requested a run; a known `key` returns the existing run."""
 
     row: RunRow

@@ -1,8 +1,8 @@
 """Keeps hidden episodes and agents on different kernels, since a kernel's counters reveal one's activity to the other.
 
-docs/explanation/hidden-episodes.md has the rules. `kernels` lists the occupants of a kernel, `occupancies` how long a
-lease occupies one, `conflicts` which occupants exclude each other. The folder `agents` has the permits of agents and
-the order of precedence.
+docs/explanation/hidden-episodes.md has the rules. `occupancies` says how long a lease occupies a kernel, `conflicts`
+lists the occupants of a kernel and says which exclude each other. The folder `agents` has the permits of agents and the
+order of precedence.
 
 What may begin on a kernel, for a case set and its relatives. Several states may hold at once; each forbids its part.
 

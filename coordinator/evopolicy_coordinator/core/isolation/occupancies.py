@@ -17,7 +17,7 @@ from evopolicy_common.messages.worker import HeldLease
 from evopolicy_coordinator.core.contract.records import KernelRow
 from evopolicy_coordinator.core.isolation import conflicts
 from evopolicy_coordinator.core.isolation.conflicts import put, related
-from evopolicy_coordinator.core.structures import take
+from evopolicy_coordinator.core.structures import pop_entry
 from evopolicy_coordinator.core.tables.model import Lease, Occupancies, Occupancy, Worker
 from evopolicy_coordinator.core.tables.state import State
 from evopolicy_coordinator.core.tables.step import Step
@@ -62,7 +62,7 @@ def vacate(state: State, lease: Lease, worker: Worker, step: Step, *, sure: bool
 def _gone(state: State, occupancy: Occupancy, step: Step) -> None:
     """Remove an ended occupancy, and mark the work that it barred."""
     index, case_set = _index(occupancy), occupancy.case_set
-    take(index, case_set, occupancy.key)
+    pop_entry(index, case_set, occupancy.key)
     if not related(index, case_set):
         conflicts.freed(state, case_set, step, train_too=occupancy.hidden)
     conflicts.tidy(state, occupancy.kernel)
@@ -71,7 +71,7 @@ def _gone(state: State, occupancy: Occupancy, step: Step) -> None:
 
 def forget(state: State, occupancy: Occupancy, step: Step) -> None:
     """Remove a lingering occupancy that has surely ended."""
-    take(state.lingering, occupancy.worker, occupancy.id)
+    pop_entry(state.lingering, occupancy.worker, occupancy.id)
     _gone(state, occupancy, step)
 
 

@@ -18,7 +18,7 @@ from evopolicy_common.messages import worker as wire
 from evopolicy_common.messages.episode import Tier
 from evopolicy_coordinator.core.contract.events import DescriptionAwaited, WorkerRegistered
 from evopolicy_coordinator.core.leasing import queue
-from evopolicy_coordinator.core.structures import take
+from evopolicy_coordinator.core.structures import pop_entry
 from evopolicy_coordinator.core.tables.model import Flow, JobState, Kernel, OutOfService, Profile, Worker
 from evopolicy_coordinator.core.tables.state import State
 from evopolicy_coordinator.core.tables.step import Step
@@ -251,7 +251,7 @@ def unpark(worker: Worker) -> None:
     assert worker.poll is not None
     del profile.parked[worker.name]
     for item in worker.poll.warm:
-        take(profile.warm, item, worker.name)
+        pop_entry(profile.warm, item, worker.name)
 
 
 def failed(state: State, worker: Worker, step: Step) -> None:

@@ -98,7 +98,7 @@ def _enter(state: State, job: JobState, worker: Worker, attempt: int, step: Step
 def let_go(state: State, group: JobGroup, now: float) -> None:
     """Stop counting the time for which a submit is held."""
     if group.held_since is not None:
-        group.held_s = group.held(now)
+        group.held_s = group.held_until_s(now)
         group.held_since = None
         del state.held[group]
 

@@ -10,7 +10,7 @@ Rules that this module owns:
   the bundle warm may deviate from this by a bounded amount.
 - Within a flow jobs go in order; jobs that return after a failure go to the front.
 - A job is not leased to a worker that it avoids while its lane has another one.
-- No operation visits all jobs, all flows or all workers: flows are in heaps, removed entries are void by ticket.
+- No operation visits all jobs, all flows or all workers: flows are in heaps, removed entries are void by generation.
 """
 
 from __future__ import annotations
@@ -123,7 +123,7 @@ def put(state: State, job: JobState, step: Step, *, front: bool = False) -> None
     """Queue a job, and mark its lane for the scheduler."""
     flow, priority, lane = job.group.flow, job.priority, job.group.flow.lane
     job.move("queued")
-    job.ticket += 1
+    job.generation += 1
     if lane is not None:
         lane.count(priority, flow, 1)
         step.dirty[lane] = None
@@ -131,7 +131,7 @@ def put(state: State, job: JobState, step: Step, *, front: bool = False) -> None
         state.suspects[job] = None
         return
     ready = flow.ready[priority]
-    (ready.appendleft if front else ready.append)((job.ticket, job))
+    (ready.appendleft if front else ready.append)((job.generation, job))
     if flow.n_ready[priority] == 0:
         # An idle flow starts at the clock, so that idleness earns nothing.
         flow.served[priority] = max(flow.served[priority], state.clock[_RANK[priority]])
@@ -148,7 +148,7 @@ def withdraw(state: State, job: JobState) -> None:
     if job.place != "queued":
         return
     flow, priority = job.group.flow, job.priority
-    job.ticket += 1
+    job.generation += 1
     if flow.lane is not None:
         flow.lane.count(priority, flow, -1)
     if job.alone:
@@ -164,7 +164,7 @@ def withdraw(state: State, job: JobState) -> None:
             _settle(lane)
 
 
-def take(state: State, worker: Worker, warm: Collection[str], now: float) -> JobState | None:
+def take_job(state: State, worker: Worker, warm: Collection[str], now: float) -> JobState | None:
     """Remove and return the next job for `worker`; None when no waiting job is for it."""
     for rank in _ranks(worker):
         passed: list[tuple[Flow, int]] = []
@@ -260,8 +260,8 @@ def _first(flow: Flow, priority: int, worker: Worker, now: float, *, sole: bool)
     skipped: list[tuple[int, JobState]] = []
     best: JobState | None = None
     while ready and len(skipped) < SKIPS_MAX:
-        ticket, job = ready[0]
-        if job.ticket != ticket:
+        generation, job = ready[0]
+        if job.generation != generation:
             ready.popleft()
         elif job.avoid == worker.name and now < job.avoid_until and not sole:
             skipped.append(ready.popleft())
@@ -294,7 +294,7 @@ def _ranks(worker: Worker) -> tuple[tuple[int, ...], ...]:
 def _next(flow: Flow, priority: int) -> JobState:
     """The first of a flow's ready jobs, which must exist. Drops void entries ahead of it."""
     ready = flow.ready[priority]
-    while ready[0][1].ticket != ready[0][0]:
+    while ready[0][1].generation != ready[0][0]:
         ready.popleft()
     return ready[0][1]
 

@@ -42,7 +42,7 @@ def request(state: State, event: events.EvaluationRequested, step: Step) -> None
         pins.pin(state, evaluation.flow, step)
     else:
         pins.place(state, evaluation.flow, row.fingerprint_class, step)
-    play(state, evaluation, step)
+    queue_jobs(state, evaluation, step)
     step.reply(event.request, operator.EvaluationStarted(evaluation=row.evaluation, episodes=len(row.cases)))
 
 
@@ -58,7 +58,7 @@ def enter(state: State, row: EvaluationRow) -> Evaluation:
     return evaluation
 
 
-def play(state: State, evaluation: Evaluation, step: Step) -> None:
+def queue_jobs(state: State, evaluation: Evaluation, step: Step) -> None:
     group = templates.evaluation(evaluation, step)
     groups.open_group(state, group, step)
 

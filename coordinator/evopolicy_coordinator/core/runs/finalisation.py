@@ -75,7 +75,7 @@ def close(state: State, event: events.Requested[gateway.CloseRun], step: Step) -
     """The agent is gone: the run takes no more submits, and its hidden cases are played. A second
     close changes nothing."""
     message = event.message
-    run = requests.known(state, message.run)
+    run = requests.known_run(state, message.run)
     if run is not None and run.state.phase == "open":
         requests.check_whole(run, message.after)
     permits.end(state, message.run, step, "its run was closed")
@@ -117,7 +117,7 @@ def cancel(state: State, event: events.Requested[operator.CancelRun], step: Step
     """End a run at once on an operator's command; it is not scored. Also ends an evaluation of that name."""
     message = event.message
     if not evaluations.cancel(state, message.run, step):
-        run = requests.known(state, message.run)
+        run = requests.known_run(state, message.run)
         if run is not None:
             _cancel(state, run, step)
     step.reply(event.request, operator.Done())

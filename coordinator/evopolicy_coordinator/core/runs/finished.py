@@ -154,7 +154,7 @@ def result(
 
 def waited(state: State, event: events.Requested[operator.WaitRun], step: Step) -> None:
     message = event.message
-    run = requests.known(state, message.run)
+    run = requests.known_run(state, message.run)
     if run is None:
         step.add(ReadFinished(request=event.request, run=message.run))
         return

@@ -78,7 +78,7 @@ def disclose(state: State, event: events.DisclosureRequested, step: Step) -> Non
     step.reply(event.request, Done())
 
 
-def _append(state: State, entry: journal.Entry, step: Step, reveals: str = "") -> JournalRow:
+def _append(state: State, entry: journal.EpochEntry, step: Step, reveals: str = "") -> JournalRow:
     last = state.journal
     data = journal.document(entry)
     head = journal.EMPTY_HEAD if last is None else last.head

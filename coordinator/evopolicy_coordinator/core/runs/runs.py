@@ -29,7 +29,7 @@ MOST_INSTALLATIONS = 64
 """A run's record names no more: a worker may register as often as it wants, each time with another one."""
 
 
-def create(state: State, event: events.RunCreated, step: Step) -> None:
+def create(state: State, event: events.RunRequested, step: Step) -> None:
     """Create a run, once for each key."""
     row = event.row
     known = state.run_keys.get(row.key)
@@ -149,7 +149,7 @@ def last_state(row: RunStateRow) -> gateway.RunState:
 def held_s(state: State, run: Run, now: float) -> float:
     """Seconds for which hidden jobs held a run's submits."""
     group = None if run.open is None else state.groups.get(submit_group(run.id, run.open, "train"))
-    return sum(row.held_s for row in run.submits) + (0.0 if group is None else group.held(now))
+    return sum(row.held_s for row in run.submits) + (0.0 if group is None else group.held_until_s(now))
 
 
 def run_state(state: State, run: Run, now: float) -> tuple[gateway.RunState, Reason | None]:
@@ -159,7 +159,7 @@ def run_state(state: State, run: Run, now: float) -> tuple[gateway.RunState, Rea
         group = state.groups[submit_group(run.id, run.open, "train")]
         waits_for = waits.waits_for(state, group)
         in_flight = gateway.SubmitInFlight(
-            submit_index=run.open, n_episodes=group.n, n_done=group.done, held_s=group.held(now)
+            submit_index=run.open, n_episodes=group.n, n_done=group.done, held_s=group.held_until_s(now)
         )
     current = gateway.RunState(
         remaining_budget=run.ledger.available,

@@ -99,10 +99,10 @@ def _accept(state: State, run: Run, event: events.Requested[gateway.Submit], ste
         return
     step.persist(row)
     run.open = index
-    play(state, run, row, step)
+    queue_jobs(state, run, row, step)
 
 
-def play(state: State, run: Run, row: SubmitRow, step: Step) -> None:
+def queue_jobs(state: State, run: Run, row: SubmitRow, step: Step) -> None:
     """Queue the unfinished jobs of an open submit."""
     groups.open_group(state, templates.train(run, row, step), step)
 
@@ -143,7 +143,7 @@ def limit_passed(state: State, name: str, step: Step) -> None:
     run = state.runs[group.run]
     limit_s = run.row.settings.limits.submit_wall_s
     assert limit_s is not None
-    held_s = group.held(step.now) - group.held_counted_s
+    held_s = group.held_until_s(step.now) - group.held_counted_s
     if held_s > 0.0:
         group.held_counted_s += held_s
         state.timers.arm(("submit", name), step.now + held_s)
@@ -179,7 +179,7 @@ def end(
         released=group.done if n_kept else 0,
         n_kept=n_kept,
         mean_return=group.mean_return() if status == "ok" else None,
-        held_s=group.held(step.now),
+        held_s=group.held_until_s(step.now),
     )
     started_at = group.first_leased_at or step.now
     run.queue_s += max(0.0, started_at - row.accepted_at)
@@ -195,7 +195,7 @@ def end(
 def results(state: State, event: events.Requested[gateway.ResultsRequest], step: Step) -> None:
     """A gateway polls for outcomes: answered at once, or when there are more than it has."""
     message = event.message
-    run = requests.known(state, message.run)
+    run = requests.known_run(state, message.run)
     if run is None:
         step.add(
             ReadResults(

@@ -13,7 +13,7 @@ class InvariantError(AssertionError):
     """The core's state is inconsistent: a bug."""
 
 
-def take(index: dict[K, dict[N, T]], key: K, name: N) -> T | None:
+def pop_entry(index: dict[K, dict[N, T]], key: K, name: N) -> T | None:
     """Removes and returns the entry under a key and a name; None when it is missing. Drops an empty key."""
     there = index.get(key)
     taken = None if there is None else there.pop(name, None)

@@ -11,7 +11,7 @@ import heapq
 from typing import Literal, NamedTuple
 
 from evopolicy_coordinator.core.contract.events import RequestId
-from evopolicy_coordinator.core.structures import take
+from evopolicy_coordinator.core.structures import pop_entry
 
 TimerKey = tuple[str, object]
 """Kind of timer, and its subject."""
@@ -99,17 +99,17 @@ class Polls:
         self._timers.arm(("poll", poll.request), now + wait_s)
         return True
 
-    def take(self, request: RequestId) -> Poll | None:
+    def take_poll(self, request: RequestId) -> Poll | None:
         """Remove a poll; None when it no longer waits."""
         poll = self._polls.pop(request, None)
         if poll is not None:
             self._timers.disarm(("poll", request))
-            take(self._of, poll.target, request)
+            pop_entry(self._of, poll.target, request)
         return poll
 
     def take_all(self, target: str) -> list[Poll]:
         """Remove all polls for `target`, in order of arrival."""
-        polls = [self.take(request) for request in list(self._of.get(target, ()))]
+        polls = [self.take_poll(request) for request in list(self._of.get(target, ()))]
         return [poll for poll in polls if poll is not None]
 
     def __len__(self) -> int:

@@ -174,8 +174,8 @@ class JobState:
     attempts: int
     """Number of the last attempt."""
     priority: int
-    ticket: int = 0
-    """Incremented whenever the job enters or leaves the queue; queue entries with an older ticket are void."""
+    generation: int = 0
+    """Incremented whenever the job enters or leaves the queue; queue entries with an older generation are void."""
     place: Place = "new"
     """`transitions.JOB` lists the allowed successors."""
     lease: Lease | None = None
@@ -252,7 +252,7 @@ class JobGroup:
     """Part of the held time by which the submit's limit has been extended."""
     closed: bool = False
 
-    def held(self, now: float) -> float:
+    def held_until_s(self, now: float) -> float:
         """Seconds for which none of its episodes ran because hidden jobs occupied its kernels."""
         return self.held_s + (0.0 if self.held_since is None else max(0.0, now - self.held_since))
 

@@ -18,7 +18,7 @@ from evopolicy_coordinator.core.contract.records import (
     PermitRow,
 )
 from evopolicy_coordinator.core.contract.settings import CoreSettings
-from evopolicy_coordinator.core.structures import take
+from evopolicy_coordinator.core.structures import pop_entry
 from evopolicy_coordinator.core.structures.timers import Polls, Timers
 from evopolicy_coordinator.core.tables.model import (
     EVERYWHERE,
@@ -192,7 +192,7 @@ class CaseSets:
         case_set.users += 1
         return case_set
 
-    def known(self) -> Iterable[CaseSet]:
+    def known_sets(self) -> Iterable[CaseSet]:
         return self._known.values()
 
     def leave(self, case_set: CaseSet | None) -> None:
@@ -207,4 +207,4 @@ class CaseSets:
             if other is not case_set:
                 del other.relatives[case_set]
         for key in case_set.cases:
-            take(self._of_case, key, case_set)
+            pop_entry(self._of_case, key, case_set)

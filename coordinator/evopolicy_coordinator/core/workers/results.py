@@ -42,7 +42,7 @@ one episode, whatever its size, so a run with a larger outcome could never tell 
 MAX_LENGTH = 2**31 - 1
 
 
-def take(state: State, news: ResultsPersisted, step: Step) -> None:
+def take_results(state: State, news: ResultsPersisted, step: Step) -> None:
     worker, result = news.worker, news.result
     job = state.jobs.get(result.job_id)
     lease = worker.leases.get(result.lease_id)

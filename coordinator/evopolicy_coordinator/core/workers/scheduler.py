@@ -104,7 +104,7 @@ def _fill(state: State, worker: Worker, step: Step) -> list[wire.Lease]:
     limit = min(_limit(state, worker, poll.n, free), LEASES_MAX, HELD_MAX - len(worker.leases))
     n_episodes = 0
     while len(given) < limit and n_episodes < EPISODES_MAX:
-        job = queue.take(state, worker, poll.warm, step.now)
+        job = queue.take_job(state, worker, poll.warm, step.now)
         if job is None:
             break
         given.append(leases.grant(state, job, worker, step))

@@ -100,14 +100,14 @@ class Cluster:
                 await asyncio.sleep(_RETRY_S)
                 continue
             cost_s = status.cost_s or time.monotonic() - began
-            self.take(status)
+            self.take_status(status)
             self._pause_s = min(_IDLE_S, max(_LEAST_PAUSE_S, _SHARE * cost_s))
             await asyncio.sleep(self._pause_s)
             if not self._watched():
                 self._wake.clear()
                 await set_within(self._wake, _IDLE_S - self._pause_s)
 
-    def take(self, status: StatusReply) -> None:
+    def take_status(self, status: StatusReply) -> None:
         self.status, self._at, self.trouble = status, time.monotonic(), ""
         for run in status.runs:
             if run.retries:

@@ -101,7 +101,9 @@ class Detail:
             return files or ()
         folder = self._numbered("checkpoints/submit_", index)
         return _ordered(
-            CodeFile(path=path, size=size, text=_as_text(self.files.read(f"{folder}/{path}", MAX_TEXT + 1)))
+            CodeFile(
+                path=path, size=size, text=_as_text(self.files.read_file(f"{folder}/{path}", MAX_TEXT + 1))
+            )
             for path, size in self._below(folder)
             if path not in METADATA
         )
@@ -109,9 +111,9 @@ class Detail:
     def _bundle_of(self, index: int) -> str | None:
         """The digest of a submit's snapshot, by the gateway's journal."""
         bundles_by_key: dict[str, str | None] = {}
-        for line in self.files.read(open_run.JOURNAL, _MAX_JOURNAL).splitlines():
+        for line in self.files.read_file(open_run.JOURNAL, _MAX_JOURNAL).splitlines():
             try:
-                entry = open_run.entry_decoder.decode(line)
+                entry = open_run.line_decoder.decode(line)
             except DECODE_ERRORS:
                 continue
             if isinstance(entry, Requested):
@@ -146,7 +148,7 @@ class Detail:
 
     def summary(self, index: int) -> Mapping[str, Any]:
         """A submit's summary, as its agent has it; empty where there is none."""
-        data = self.files.read(f"{self.folder_of(index)}/summary.json", _MAX_TRAJECTORY)
+        data = self.files.read_file(f"{self.folder_of(index)}/summary.json", _MAX_TRAJECTORY)
         return next(objects([data]), {})
 
     def episodes(self, index: int) -> list[int]:
@@ -164,11 +166,11 @@ class Detail:
 
     def text(self, path: str) -> str:
         """The beginning of a file as text; empty where there is none."""
-        return self.files.read(path, MAX_TEXT).decode("utf-8", "replace")
+        return self.files.read_file(path, MAX_TEXT).decode("utf-8", "replace")
 
     def played(self, folder: str) -> tuple[int, dict[str, list[Line]], str]:
         """Number of steps of an episode, its columns by title of a plot, and a note on others."""
-        lines = self.files.read(f"{folder}/trajectory.jsonl", _MAX_TRAJECTORY).splitlines()
+        lines = self.files.read_file(f"{folder}/trajectory.jsonl", _MAX_TRAJECTORY).splitlines()
         rows = list(itertools.islice(objects(lines), MAX_STEPS))
         inline = [row.get("obs") for row in rows]
         observed: Any = inline if any(each is not None for each in inline) else self._arrays(folder)
@@ -182,14 +184,14 @@ class Detail:
     def _arrays(self, folder: str) -> Any:
         for name in ("observations.npy", "observations.npz"):
             with contextlib.suppress(OSError, ValueError):
-                arrays = read_arrays(self.files.read(f"{folder}/{name}", _MAX_TRAJECTORY), _MAX_UNPACKED)
+                arrays = read_arrays(self.files.read_file(f"{folder}/{name}", _MAX_TRAJECTORY), _MAX_UNPACKED)
                 return arrays.get("", arrays)
         return None
 
     def replays(self) -> list[str]:
         """Names of the recorded hidden episodes. They are hidden results: only for whom those may be shown."""
         names = [name.name for name in self.files.names("replays") if name.is_folder]
-        return [name for name in names if self.files.read(f"replays/{name}/video.mp4", 1)]
+        return [name for name in names if self.files.read_file(f"replays/{name}/video.mp4", 1)]
 
     # ---- words and events ----
 
@@ -227,7 +229,9 @@ def _unpacked(files: Confined, digest: str) -> tuple[CodeFile, ...] | None:
     if digest in _unpacked_bundles:
         return _unpacked_bundles[digest]
     try:
-        bundle = bundles.load(files.read(f"{open_run.BUNDLES}/{digest[:2]}/{digest}", _MAX_BUNDLE), digest)
+        bundle = bundles.load(
+            files.read_file(f"{open_run.BUNDLES}/{digest[:2]}/{digest}", _MAX_BUNDLE), digest
+        )
     except (BundleError, *DECODE_ERRORS):
         return None
     unpacked = _unpacked_bundles[digest] = _ordered(

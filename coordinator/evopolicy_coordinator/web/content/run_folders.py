@@ -26,7 +26,7 @@ from evopolicy_common.records import open_run
 from evopolicy_common.records.open_run import IntendedRun, OpenedRun
 from evopolicy_common.records.policies.submits import read_submits
 from evopolicy_common.records.run_files import RUN_JSON, read_record
-from evopolicy_common.records.suite_folder import INDEX, PAUSED, Entry, Index
+from evopolicy_common.records.suite_folder import INDEX, PAUSED, Index, SweepRun
 from evopolicy_common.records.summary import Summary
 from evopolicy_common.regular_files import read_regular
 from evopolicy_results.reading.environments import learn_names
@@ -166,7 +166,7 @@ class Reader:
         self._records: dict[Path, tuple[tuple[int, int], RunFacts]] = {}
         self._submits: dict[Path, dict[int, Summary]] = {}
 
-    def read(self, cluster: Sequence[RunStatus] | None, *, cluster_is_known: bool) -> Runs:
+    def read_runs(self, cluster: Sequence[RunStatus] | None, *, cluster_is_known: bool) -> Runs:
         """All runs as they are now. `cluster`: its unfinished runs; `cluster_is_known` False: it should be asked and
         does not answer."""
         by_run = {status.run: status for status in cluster or ()}
@@ -208,7 +208,7 @@ class Reader:
         shut = frozenset(alive) if cluster_is_known else None
         return Runs(sweeps=tuple(sweeps), by_key=by_key, shut=shut, origins=frozenset(origins - {""}))
 
-    def run(self, folder: Path, entry: Entry | None, by_run: Mapping[str, RunStatus]) -> RunFacts:
+    def run(self, folder: Path, entry: SweepRun | None, by_run: Mapping[str, RunStatus]) -> RunFacts:
         try:
             info = (folder / RUN_JSON).stat()
         except OSError:
@@ -230,7 +230,7 @@ class Reader:
         consumed = itertools.accumulate(each.n_episodes for each in summaries)
         return list(map(Submit, summaries, consumed))
 
-    def _open(self, folder: Path, entry: Entry | None, by_run: Mapping[str, RunStatus]) -> RunFacts:
+    def _open(self, folder: Path, entry: SweepRun | None, by_run: Mapping[str, RunStatus]) -> RunFacts:
         intended = _decoded(folder, open_run.INTENDED, IntendedRun)
         opened = _decoded(folder, open_run.OPENED, OpenedRun)
         run = "" if opened is None else opened.run
@@ -312,7 +312,7 @@ def _finished(folder: Path) -> RunFacts:
     )
 
 
-def _elsewhere(key: str, entry: Entry | None, status: RunStatus | None) -> RunFacts:
+def _elsewhere(key: str, entry: SweepRun | None, status: RunStatus | None) -> RunFacts:
     """A run without a folder here: it has not started, or another host plays it."""
     facts: dict[str, Any] = {"key": key_of(key), "path": None}
     if entry is not None:
@@ -328,7 +328,7 @@ def _elsewhere(key: str, entry: Entry | None, status: RunStatus | None) -> RunFa
     return RunFacts(**facts)
 
 
-def _of_entry(entry: Entry) -> dict[str, Any]:
+def _of_entry(entry: SweepRun) -> dict[str, Any]:
     """The facts that a sweep's index has of every run of it."""
     tokens = [each for each in (entry.tokens, entry.earlier) if each]
     return {
@@ -389,7 +389,7 @@ def _index(root: Path) -> Index | None:
 def _decoded(folder: Path, name: str, kind: type[T]) -> T | None:
     """The content of a file of an open run; None where it is missing or damaged."""
     with contextlib.suppress(*DECODE_ERRORS):
-        return msgspec.json.decode(Confined(folder).read(name, _MAX_SUMMARY_BYTES), type=kind)
+        return msgspec.json.decode(Confined(folder).read_file(name, _MAX_SUMMARY_BYTES), type=kind)
     return None
 
 

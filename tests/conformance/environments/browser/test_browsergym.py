@@ -432,7 +432,7 @@ def test_the_random_actions_of_checks_are_calls_that_do_something(env_id: str, w
 
 @pytest.mark.parametrize("env_id", SAMPLE)
 def test_an_environment_keeps_what_the_interface_promises(env_id: str) -> None:
-    assert conformance.play(env_id, 10).verdict(None) == "ok"
+    assert conformance.play_checked(env_id, 10).verdict(None) == "ok"
 
 
 @pytest.mark.parametrize("env_id", SAMPLE)

@@ -197,7 +197,7 @@ def test_the_random_actions_of_checks_name_elements_that_there_are(warm: Warm) -
 
 @pytest.mark.parametrize("env_id", SAMPLE)
 def test_an_environment_keeps_what_the_interface_promises(env_id: str) -> None:
-    played = conformance.play(env_id, 20)
+    played = conformance.play_checked(env_id, 20)
     assert played.verdict(None) == "ok"
 
 

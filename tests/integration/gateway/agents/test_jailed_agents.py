@@ -16,7 +16,7 @@ from evopolicy_common.errors import ConfigError
 from evopolicy_common.records.open_run import IntendedRun
 from evopolicy_common.records.run_record import inputs_digest
 from evopolicy_gateway import harnesses
-from evopolicy_gateway.inputs.declared import read
+from evopolicy_gateway.inputs.declared import read_inputs
 from evopolicy_gateway.jail.settings import JailSettings
 from evopolicy_gateway.run.plan import Plan
 from evopolicy_gateway.run.run_options import RunOptions
@@ -98,7 +98,7 @@ def test_an_agent_reads_its_skill_and_cannot_change_it(tmp_path: Path) -> None:
         agent_with_a_skill(tmp_path, api.base_url)
         record, _ = played_here(tmp_path, "file:agent.toml", "--budget", "2")
     assert [each.name for each in record.agent.inputs] == ["lamps"]
-    assert record.agent.inputs == tuple(each.recorded for each in read(["skills/lamps"], {}, tmp_path))
+    assert record.agent.inputs == tuple(each.recorded for each in read_inputs(["skills/lamps"], {}, tmp_path))
     assert DESCRIPTION in json.dumps(api.requests[0])
     seen = json.dumps(api.requests[1])
     for words in ("Read the lamp twice.", "lit", "shut", "kept"):

@@ -63,7 +63,9 @@ def plan_of(root: Path, **more: Any) -> Plan:
 def played(plan: Plan, operator_file: Path) -> tuple[str, str]:
     """State of the run in its command, and the command's output."""
     output = io.StringIO()
-    done = asyncio.run(runs.play([plan], Cluster(file=operator_file), 1, Terminal(file=output, width=300)))
+    done = asyncio.run(
+        runs.play_plans([plan], Cluster(file=operator_file), 1, Terminal(file=output, width=300))
+    )
     return done.index.runs[plan.name].state, output.getvalue()
 
 

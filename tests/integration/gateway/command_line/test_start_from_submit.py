@@ -79,7 +79,7 @@ def seen(child: Path) -> dict[str, Any]:
 
 
 def test_each_submit_of_a_run_has_a_tree_that_its_record_names(parent: Path) -> None:
-    files = {name: trees.read(parent, f"submit_00{name}") for name in record_in(parent).trees}
+    files = {name: trees.read_tree(parent, f"submit_00{name}") for name in record_in(parent).trees}
     assert sorted(files) == ["0", "1", "2"]
     assert record_in(parent).trees == {name: digest for name, (_, digest) in files.items()}
     assert [file.path for file in files["2"][0].files] == ["notes.md", "system/policy.py"]
@@ -96,7 +96,7 @@ def test_a_start_has_the_workspace_of_that_submit(child: Path) -> None:
 
 
 def test_the_history_is_no_part_of_the_tree(child: Path) -> None:
-    tree, _ = trees.read(child, "submit_000")
+    tree, _ = trees.read_tree(child, "submit_000")
     assert [file.path for file in tree.files] == ["notes.md", "seen.json", "system/policy.py"]
     assert (dict(tree.omitted), tree.n_omitted) == ({}, 0)
 

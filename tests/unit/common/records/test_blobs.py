@@ -16,7 +16,7 @@ def test_what_is_put_is_read_back(tmp_path: Path) -> None:
     store = BlobStore(tmp_path)
     digest = store.put(b"hello")
     assert digest == digest_of(b"hello")
-    assert store.read(digest) == b"hello"
+    assert store.read_blob(digest) == b"hello"
     assert store.read_chunk(digest, 1, 3) == b"ell"
     assert list(store.digests()) == [digest]
 
@@ -26,10 +26,10 @@ def test_a_damaged_blob_is_refused_and_set_aside(tmp_path: Path) -> None:
     digest = store.put(b"hello")
     store.path(digest).write_bytes(b"hullo")
     with pytest.raises(StorageError, match="damaged"):
-        store.read(digest)
+        store.read_blob(digest)
     assert not store.has(digest)
     store.put(b"hello")
-    assert store.read(digest) == b"hello"
+    assert store.read_blob(digest) == b"hello"
 
 
 @given(data=st.binary(min_size=1, max_size=400), step=st.integers(1, 100))
@@ -41,7 +41,7 @@ def test_chunks_in_order_make_the_blob(
     have = 0
     while have < len(data):
         have = store.append_chunk("w", digest, len(data), have, data[have : have + step])
-    assert store.read(digest) == data
+    assert store.read_blob(digest) == data
 
 
 def test_a_chunk_out_of_order_changes_nothing(tmp_path: Path) -> None:

@@ -41,7 +41,7 @@ def run(tmp_path: Path) -> Path:
 def recorded(run: Path, recorder: Recorder | None = None, passed: Passed | None = None) -> Tree:
     recorder = recorder or Recorder(run / "workspace", run / "trees")
     digest = recorder.record("submit_000", bundles.snapshot(run / "workspace" / "system"), passed)
-    tree, again = trees.read(run, "submit_000")
+    tree, again = trees.read_tree(run, "submit_000")
     assert again == digest
     return tree
 
@@ -86,7 +86,7 @@ def test_the_policy_is_the_submitted_bundles(run: Path) -> None:
     bundle = bundles.snapshot(run / "workspace" / "system")
     (run / "workspace" / "system" / "policy.py").write_text("changed meanwhile")
     Recorder(run / "workspace", run / "trees").record("submit_000", bundle, None)
-    tree, _ = trees.read(run, "submit_000")
+    tree, _ = trees.read_tree(run, "submit_000")
     assert {file.path: file.blob for file in tree.files}["system/policy.py"] == digest_of(
         b"class Policy: ...\n"
     )
@@ -162,7 +162,7 @@ def test_a_forged_tree_is_refused(run: Path, file: TreeFile) -> None:
     recorded(run)
     (run / "trees" / "submit_000.json").write_bytes(msgspec.json.encode(Tree(files=(file,))))
     with pytest.raises(ConfigError, match="name a submit whose workspace is recorded"):
-        trees.read(run, "submit_000")
+        trees.read_tree(run, "submit_000")
 
 
 @pytest.mark.parametrize("blob", ["0" * 64, "../../../../etc/passwd"])

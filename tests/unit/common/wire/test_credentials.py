@@ -35,10 +35,10 @@ def worker(endpoint: str = "tcp/127.0.0.1:7447") -> Credentials:
 
 def test_credentials_are_for_their_owner_only(file: Path) -> None:
     assert file.stat().st_mode & 0o777 == 0o600
-    assert credentials.read(file) == worker()
+    assert credentials.read_credentials(file) == worker()
     file.chmod(0o640)
     with pytest.raises(ConfigError, match="chmod 600"):
-        credentials.read(file)
+        credentials.read_credentials(file)
 
 
 def test_a_command_finds_the_cluster_that_it_is_pointed_at(file: Path) -> None:
@@ -165,4 +165,4 @@ def test_what_is_wrong_with_a_machines_folder_is_named(tmp_path: Path, file: Pat
 def test_a_malformed_file_is_named(file: Path, text: str) -> None:
     file.write_text(text)
     with pytest.raises(ConfigError, match=r"worker\.json"):
-        credentials.read(file)
+        credentials.read_credentials(file)

@@ -19,7 +19,7 @@ from evopolicy_common.messages.operator import EvaluationStarted, RunProgress
 from evopolicy_common.messages.run_settings import PUBLISHED
 from evopolicy_coordinator.core.contract.effects import ReadEvaluation
 from evopolicy_coordinator.core.contract.records import EvaluationRow, RunRow
-from evopolicy_coordinator.server.reason_texts import words
+from evopolicy_coordinator.server.reason_texts import reason_text
 
 
 def value_of(job: Job) -> float:
@@ -212,7 +212,7 @@ def page(rig: Rig, cursor: int, wait_s: float = 0.0) -> ReadEvaluation:
 def test_an_evaluation_plays_cases_outside_any_run(rig: Rig) -> None:
     assert ask(rig) == EvaluationStarted(evaluation="ev-e", episodes=2)
     assert ask(rig) == EvaluationStarted(evaluation="ev-e", episodes=2)
-    assert "a worker that offers" in words(page(rig, 0).waits_for)
+    assert "a worker that offers" in reason_text(page(rig, 0).waits_for)
     session = rig.register()
     rig.load()
     session = rig.register()

@@ -28,7 +28,7 @@ def entries(rig: Rig) -> list[bytes]:
     return [row.entry for row in rows]
 
 
-def entries_of(rig: Rig) -> list[journal.Entry]:
+def entries_of(rig: Rig) -> list[journal.EpochEntry]:
     return [journal.read_entry(entry) for entry in entries(rig)]
 
 

@@ -283,7 +283,7 @@ def test_a_cancelled_runs_permit_ends_by_its_gateway_or_time(
         rig.beat(session)
     assert "validation" in splits(rig.poll(session, 8))
     rig.load()
-    assert permits.held(rig.core.state, "r1") == []
+    assert permits.permits_of_run(rig.core.state, "r1") == []
 
 
 def test_an_operators_word_ends_a_permit_and_silence_does_not(rig: Rig) -> None:
@@ -402,18 +402,18 @@ def test_a_gateway_that_asks_for_permits_opens_its_run_without_one(rig: Rig) -> 
     rig.create("r1", agent=None)
     opened = rig.ask(gateway.OpenRun, run="r1", asks_permit=True)
     assert isinstance(opened, gateway.RunOpened)
-    assert permits.held(rig.core.state, "r1") == []
+    assert permits.permits_of_run(rig.core.state, "r1") == []
 
 
 def test_a_remote_agents_stated_place_replaces_its_gateways_host(rig: Rig) -> None:
     rig.register()
     rig.create("r1", agent="gateway", agent_host="remote")
-    assert [row.boot_id for _, row in permits.held(rig.core.state, "r1")] == ["remote"]
+    assert [row.boot_id for _, row in permits.permits_of_run(rig.core.state, "r1")] == ["remote"]
 
 
 def test_a_vouched_agent_needs_no_permit_and_is_stamped(rig: Rig) -> None:
     session = rig.begin(worker={"slots": 8}, run={"agent": "", "agent_host": ELSEWHERE})
-    assert permits.held(rig.core.state, "r1") == []
+    assert permits.permits_of_run(rig.core.state, "r1") == []
     rig.submit(0)
     rig.work_off(session)
     assert rig.finish(session).hidden_isolation == "waived"

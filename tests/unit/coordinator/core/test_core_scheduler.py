@@ -16,7 +16,7 @@ from evopolicy_common.messages import worker as wire
 from evopolicy_common.messages.environment import EnvironmentDescription
 from evopolicy_coordinator.core.runs.waits import waits_for_workers
 from evopolicy_coordinator.core.workers import scheduler
-from evopolicy_coordinator.server.reason_texts import env_failure, words
+from evopolicy_coordinator.server.reason_texts import env_failure, reason_text
 from evopolicy_worker.environments.interface.fingerprint import PACKAGES
 
 
@@ -324,13 +324,13 @@ def test_a_run_waits_for_its_connected_workers_description_only(rig: Rig) -> Non
     rig.create()
     flow = rig.core.state.runs["r1"].flow
     rig.register("w1", envs=(), undescribed=(ENV,), tiers=("none",))
-    assert words(waits_for_workers(rig.core.state, flow)).startswith(f"a worker that offers {ENV}")
+    assert reason_text(waits_for_workers(rig.core.state, flow)).startswith(f"a worker that offers {ENV}")
     rig.register("w2", envs=(), undescribed=(ENV,))
-    assert words(waits_for_workers(rig.core.state, flow)) == (
+    assert reason_text(waits_for_workers(rig.core.state, flow)) == (
         f"a connected worker to describe {ENV}, as it does before its first episode"
     )
     rig.ask(operator.SetWorker, worker="w2", state="paused")
-    assert words(waits_for_workers(rig.core.state, flow)).endswith(": those that do are paused")
+    assert reason_text(waits_for_workers(rig.core.state, flow)).endswith(": those that do are paused")
     rig.register("w3")
     assert waits_for_workers(rig.core.state, flow) is None
 

@@ -16,7 +16,7 @@ from evopolicy_common.messages.worker import Refused
 from evopolicy_common.refusals import Refusal
 from evopolicy_coordinator.core.contract.effects import Refuse, Reply
 from evopolicy_coordinator.core.contract.reasons import REFUSALS, because
-from evopolicy_coordinator.server.reason_texts import TEXTS, message, words
+from evopolicy_coordinator.server.reason_texts import TEXTS, message, reason_text
 
 CORE = Path(evopolicy_coordinator.core.__file__).parent
 
@@ -57,7 +57,7 @@ def test_why_an_environment_failed_is_told_to_operators_alone() -> None:
     why = 'step 3: it raised KeyError: 7; File "/home/me/secret.py", line 3'
     waits = because("workers", lacking=(), failed=(("lab-1", why), ("lab-2", "another")), **about)
     for_agents = "a worker that offers my/x with sandbox tier bwrap; it failed on lab-1, lab-2"
-    assert words(waits) == for_agents
+    assert reason_text(waits) == for_agents
     progress = message(Reply(request=1, message=RunProgress(phase="open", done=0, total=1), waits_for=waits))
     assert isinstance(progress, RunProgress)
     assert (progress.waits_for, progress.env_failure) == (f"{for_agents}: {why}", why)

@@ -275,7 +275,7 @@ def test_an_oversized_blob_is_never_read(
 ) -> None:
     monkeypatch.setattr(codec, "MAX_PACKED_BYTES", 1000)
     digest = blobs.put(bytes(1001))
-    monkeypatch.setattr(blobs, "read", None)
+    monkeypatch.setattr(blobs, "read_blob", None)
     result = worker.JobResult(lease_id="l", job_id="j", attempt=1, kind="done")
     for size in (1001, 1000):  # as it is, and as a liar says
         ref = BlobRef(digest=digest, size=size)

@@ -38,7 +38,7 @@ class Rig:
         self._answered: queue.Queue[Message | None] = queue.Queue()
 
     def page(self, effect: ReadResults | ReadEvaluation | ReadFinished) -> Any:
-        self.reader.read(effect, self._answered.put)
+        self.reader.answer_read(effect, self._answered.put)
         return self._answered.get(timeout=10)
 
     def results(self, cursor: int, upto: int | None) -> Any:

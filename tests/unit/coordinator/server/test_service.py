@@ -532,6 +532,6 @@ async def test_uploads_that_no_submit_named_are_deleted_once_their_run_is_over(
             kept_before,
             b"left behind in an open run",
         )
-        assert all(world.blobs.read(digest_of(data)) == data for data in in_use)
+        assert all(world.blobs.read_blob(digest_of(data)) == data for data in in_use)
         assert world.uploads.has_sent(other.run, digest_of(b"in both runs"))
         assert not world.uploads.has_sent(one.run, digest_of(b"named"))

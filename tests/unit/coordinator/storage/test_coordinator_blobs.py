@@ -106,9 +106,9 @@ def test_a_stored_blob_is_read_whole_and_in_chunks(rig: Rig) -> None:
     empty = rig.blobs.put(b"")
     for blobs in (rig.blobs, rig.opened()):
         assert blobs.hold(DIGEST) == blobs.size(DIGEST) == len(DATA)
-        assert blobs.read(DIGEST) == DATA
+        assert blobs.read_blob(DIGEST) == DATA
         assert blobs.read_chunk(DIGEST, 4, 5) == DATA[4:9]
-        assert blobs.read(empty) == b""
+        assert blobs.read_blob(empty) == b""
     assert set(rig.blobs.digests()) == {DIGEST, empty}
     rig.restart()
     assert rig.blobs.read_chunk(DIGEST, 0, 99) == DATA
@@ -127,10 +127,10 @@ def test_a_swapped_or_truncated_blob_is_never_read(rig: Rig, other: bytes) -> No
     rig.blobs.put(DATA)
     rig.replace(DIGEST, other)
     with pytest.raises(StorageError):
-        rig.blobs.read(DIGEST)
+        rig.blobs.read_blob(DIGEST)
     # A gateway sends all bytes again, and then they are there again.
     rig.blobs.append_chunk("gw/r", DIGEST, len(DATA), 0, DATA, lambda _: None)
-    assert rig.opened().read(DIGEST) == DATA
+    assert rig.opened().read_blob(DIGEST) == DATA
 
 
 @pytest.mark.cluster
@@ -164,7 +164,7 @@ def test_the_last_chunk_is_stored_when_it_is_sent_again(rig: Rig, monkeypatch: p
         rig.blobs.append_chunk("w", DIGEST, len(DATA), 5, DATA[5:])
     monkeypatch.setattr(type(rig.blobs), "_keep", keep)
     assert rig.blobs.append_chunk("w", DIGEST, len(DATA), 5, DATA[5:]) == len(DATA)
-    assert rig.blobs.read(DIGEST) == DATA
+    assert rig.blobs.read_blob(DIGEST) == DATA
 
 
 def test_a_collection_takes_old_blobs_that_no_row_names(rig: Rig) -> None:
@@ -178,7 +178,10 @@ def test_a_collection_takes_old_blobs_that_no_row_names(rig: Rig) -> None:
     assert rig.blobs.has(gone)
     assert rig.collect() == 1
     assert set(rig.blobs.digests()) == {kept, recorded.digest}
-    assert [rig.blobs.read(each) for each in (kept, recorded.digest)] == [b"a named bundle", b"a recording"]
+    assert [rig.blobs.read_blob(each) for each in (kept, recorded.digest)] == [
+        b"a named bundle",
+        b"a recording",
+    ]
     if rig.objects is not None:
         assert len(rig.objects.paths(rig.address)) == 2
 
@@ -204,7 +207,7 @@ def test_a_blob_stored_during_a_collection_stays(rig: Rig, how: str, monkeypatch
     monkeypatch.setattr(disk_use, "_named", meanwhile)
     rig.collect()
     rig.restart()
-    assert rig.blobs.read(DIGEST) == DATA
+    assert rig.blobs.read_blob(DIGEST) == DATA
 
 
 @pytest.mark.cluster
@@ -223,7 +226,7 @@ def test_no_row_names_a_blob_that_was_collected_meanwhile(remote: Rig) -> None:
     remote.store.write([submit_row(bundle=DIGEST)])
     remote.age()
     assert remote.collect() == 0
-    assert remote.opened().read(DIGEST) == DATA
+    assert remote.opened().read_blob(DIGEST) == DATA
 
 
 @pytest.mark.cluster
@@ -249,7 +252,7 @@ def test_a_late_deletion_never_meets_a_new_upload(remote: Rig, monkeypatch: pyte
     remote.store.write([submit_row(bundle=DIGEST)])
     go_on.set()
     collector.join(30)
-    assert remote.opened().read(DIGEST) == DATA
+    assert remote.opened().read_blob(DIGEST) == DATA
     (left,) = remote.objects.paths(remote.address) if remote.objects else ()
     assert DIGEST in left
 
@@ -292,7 +295,7 @@ def test_two_collections_at_once_take_no_named_blob(remote: Rig, monkeypatch: py
 
     monkeypatch.setattr(disk_use, "_named", meanwhile)
     remote.collect()
-    assert remote.opened().read(DIGEST) == DATA
+    assert remote.opened().read_blob(DIGEST) == DATA
 
 
 @pytest.mark.cluster
@@ -379,7 +382,7 @@ def test_blobs_move_to_an_object_store_and_back(tmp_path: Path, object_store: Ob
     assert move_blobs(rig.root, str(rig.root / "blobs")) == 3
     back = blobs_of(rig.root, rig.root / DATABASE)
     assert type(back) is BlobStore
-    assert {digest_of(back.read(each)) for each in back.digests()} == stored
+    assert {digest_of(back.read_blob(each)) for each in back.digests()} == stored
 
 
 @pytest.mark.cluster

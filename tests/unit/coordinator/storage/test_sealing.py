@@ -48,7 +48,7 @@ class Folder:
 
     def lead(self) -> Store:
         store = Store(self.database)
-        self.shared.take(store.sealed())
+        self.shared.take_sealed(store.sealed())
         store.load()
         self.shared.push(store)
         return store

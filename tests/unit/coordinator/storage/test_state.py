@@ -42,7 +42,7 @@ def test_identity_survives_a_restart_and_nobody_else_reads_it(tmp_path: Path) ->
 def test_each_role_gets_its_own_password_and_only_its_own_token(tmp_path: Path) -> None:
     state = StateFolder.open(tmp_path / "state")
     files = state.write_credentials(("tcp/10.0.0.5:7447",))
-    found = {role: credentials.read(path) for role, path in files.items()}
+    found = {role: credentials.read_credentials(path) for role, path in files.items()}
     assert {c.cluster for c in found.values()} == {"local"}
     assert len({c.password for c in found.values()}) == 3
     assert found["worker"].token == state.identity.worker_token

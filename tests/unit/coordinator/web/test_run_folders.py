@@ -8,14 +8,14 @@ from pathlib import Path
 import msgspec
 from invented.web_site import finished_run, open_run, open_status
 
-from evopolicy_common.records.suite_folder import INDEX, Entry, Index
+from evopolicy_common.records.suite_folder import INDEX, Index, SweepRun
 from evopolicy_coordinator.web.content.run_folders import Reader
 
 
 def test_a_sweep_shows_its_runs_on_all_hosts_once(tmp_path: Path) -> None:
     root = tmp_path / "runs"
     here = open_run(root, exp_id="s-0", run="r-here")
-    entry = partial(Entry, agent="Agent B", env="gym/acrobot", digest="d")
+    entry = partial(SweepRun, agent="Agent B", env="gym/acrobot", digest="d")
     directory = str(here.relative_to(root))
     entries = (
         entry(name="b/0", repeat=0, state="running", run="r-here", directory=directory),
@@ -28,7 +28,7 @@ def test_a_sweep_shows_its_runs_on_all_hosts_once(tmp_path: Path) -> None:
     other = open_status(
         "r-there", exp_id="s-1", repeat=1, best_mean=-70.5, waits_for="a free slot", agent_host="lab2"
     )
-    found = Reader([tmp_path]).read([open_status("r-here", exp_id="s-0"), other], cluster_is_known=True)
+    found = Reader([tmp_path]).read_runs([open_status("r-here", exp_id="s-0"), other], cluster_is_known=True)
     (sweep,) = (sweep for sweep in found.sweeps if sweep.runs)
     assert sweep.name == "s"
     first, second, third, fourth = sorted(sweep.runs, key=lambda run: run.repeat)
@@ -48,7 +48,7 @@ def test_runs_beside_sweeps_are_shown_apart_from_them(tmp_path: Path) -> None:
     open_run(tmp_path / "sweep")
     (tmp_path / "sweep" / "suite.json").write_text('{"suite": "inner"}')
     finished_run(tmp_path / "other")
-    found = Reader([tmp_path]).read(None, cluster_is_known=True)
+    found = Reader([tmp_path]).read_runs(None, cluster_is_known=True)
     assert {sweep.name: len(sweep.runs) for sweep in found.sweeps} == {"inner": 1, tmp_path.name: 1}
 
 
@@ -57,7 +57,7 @@ def test_a_damaged_record_is_a_run_with_that_error_and_stops_nothing(tmp_path: P
     open_run(tmp_path)
     (folder / "run.json").write_text("{")
     reader = Reader([tmp_path])
-    found = reader.read(None, cluster_is_known=True)
+    found = reader.read_runs(None, cluster_is_known=True)
     assert sorted(run.state for run in found.by_key.values()) == ["interrupted", "unreadable"]
     assert "not a run record" in next(run.error for run in found.by_key.values() if run.finished)
 

@@ -53,7 +53,7 @@ def test_retries_that_the_coordinator_no_longer_tells_of_are_kept_and_bounded(tm
     assert site.cluster is not None
     for number in range(3 * _RETRIES_OF_A_RUN):
         later = RetriedJobs(at=LOST.at + 1.0 + number, worker="w", failure="overdue")
-        site.cluster.take(status(open_status("r-open", retries=(later,))))
+        site.cluster.take_status(status(open_status("r-open", retries=(later,))))
         if number == 0:
             assert list(site.cluster.retries["r-open"]) == [LOST, later]
     assert len(site.cluster.retries["r-open"]) == _RETRIES_OF_A_RUN

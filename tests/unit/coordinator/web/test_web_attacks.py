@@ -46,7 +46,7 @@ from invented.web_site import (
 
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.messages.status import RunStatus, WorkerStatus
-from evopolicy_common.records.suite_folder import INDEX, Entry, Index
+from evopolicy_common.records.suite_folder import INDEX, Index, SweepRun
 from evopolicy_common.wire import http as server
 from evopolicy_coordinator.pki import certs
 from evopolicy_coordinator.web import app
@@ -476,7 +476,7 @@ def test_without_a_cluster_the_lock_of_an_agent_keeps_scores_hidden(tmp_path: Pa
 
 
 def test_scores_in_a_sweeps_index_are_hidden_as_well(tmp_path: Path) -> None:
-    entry = Entry(
+    entry = SweepRun(
         name="a", agent="Agent B", env="gym/acrobot", repeat=0, digest="d", state="completed", score=4242.5,
         random=-4322.5, host="lab2",
     )  # fmt: skip

@@ -198,7 +198,7 @@ def test_without_cgroups_the_jail_limits_cores_and_pids(
     assert held.used().limits == AgentLimits(cpus=1.0, pids=64)
     assert held.used().kept_by == {"cpus": "affinity", "pids": "rlimit"}
     assert (held.fixed_cores, held.own_pids, held.joins) == (True, 64, ())
-    assert "memory 1,000,000,000 bytes (no cgroup can be made here: unlimited)" in held.words()
+    assert "memory 1,000,000,000 bytes (no cgroup can be made here: unlimited)" in held.limits_text()
     assert loose.used().limits == AgentLimits()
 
 

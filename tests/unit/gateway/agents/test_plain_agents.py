@@ -11,9 +11,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from evopolicy_gateway.agents.client import ProtocolError, Refusal, Verdict
-from evopolicy_gateway.agents.replay import folder_for, play, policies_in, shares, stage
+from evopolicy_gateway.agents.replay import folder_for, policies_in, shares, stage, submit_all
 from evopolicy_gateway.agents.uniform import POLICY
-from evopolicy_gateway.agents.uniform import play as play_uniform
+from evopolicy_gateway.agents.uniform import submit_random as play_uniform
 from evopolicy_worker.environments import compile_actions
 
 
@@ -112,12 +112,12 @@ def test_replay_submits_each_policy_with_its_share(tmp_path: Path) -> None:
     for name in "abc":
         policy(tmp_path / "given" / name, name)
     client = FakeClient(budget=10)
-    assert play(client, tmp_path / "given", tmp_path) == 3  # type: ignore[arg-type]
+    assert submit_all(client, tmp_path / "given", tmp_path) == 3  # type: ignore[arg-type]
     assert client.asked == [[0, 1, 2, 0], [0, 1, 2], [0, 1, 2]]
     assert (tmp_path / "system" / "policy.py").read_text() == "c"
     (tmp_path / "empty").mkdir()
     with pytest.raises(ProtocolError, match="no policy"):
-        play(client, tmp_path / "empty", tmp_path)  # type: ignore[arg-type]
+        submit_all(client, tmp_path / "empty", tmp_path)  # type: ignore[arg-type]
 
 
 SPACES: list[dict[str, Any]] = [

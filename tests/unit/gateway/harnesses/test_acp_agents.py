@@ -166,7 +166,7 @@ def test_tokens_of_requests_are_added_where_the_answer_has_none() -> None:
     counts = {"inputTokens": 100, "outputTokens": 5, "totalTokens": 105, "cachedReadTokens": 70}
     reader = AcpReader()
     for _ in range(2):
-        reader.read({**chunk, "_meta": {"usage": counts}})
+        reader.read_event({**chunk, "_meta": {"usage": counts}})
     # A turn that fails has spent them too.
     assert reader.usage == Usage(input_noncached=60, cache_read=140, output=10)
     reader.ended({"stopReason": "end_turn"})
@@ -183,7 +183,7 @@ def test_odd_updates_are_skipped() -> None:
         {"sessionUpdate": "agent_message_chunk", "content": "x"},
         {"sessionUpdate": "tool_call_update", "status": "completed", "toolCallId": None},
     ):
-        reader.read(update)
+        reader.read_event(update)
     reader.ended({"stopReason": "cancelled", "usage": 3, "_meta": []})
     assert (reader.done, reader.text, reader.usage) == (False, "", Usage())
 
@@ -192,16 +192,16 @@ def test_the_memory_of_a_turn_is_bounded() -> None:
     reader = AcpReader()
     large = {"text": "x" * (300 << 10)}
     for n in range(1000):
-        reader.read(
+        reader.read_event(
             {"sessionUpdate": "tool_call", "toolCallId": f"t{n}", "title": "Write", "rawInput": large}
         )
-        reader.read({"sessionUpdate": "agent_message_chunk", "content": {"text": ""}})
+        reader.read_event({"sessionUpdate": "agent_message_chunk", "content": {"text": ""}})
     assert len(reader._calls) == 64
     assert sum(len(str(call)) for call in reader._calls.values()) < 1 << 20
     assert reader._text == []
     # The latest are still known by name.
     reader.entries()
-    reader.read({"sessionUpdate": "tool_call_update", "toolCallId": "t999", "status": "completed"})
+    reader.read_event({"sessionUpdate": "tool_call_update", "toolCallId": "t999", "status": "completed"})
     used = reader.entries()[0]["message"]["content"][0]
     assert (used["name"], used["input"]) == ("Write", {"title": "Write"})
 

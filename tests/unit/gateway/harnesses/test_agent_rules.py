@@ -136,7 +136,7 @@ def test_messages_of_claude_are_counted_once_each_however_many_there_are() -> No
 
     def report_usage(identity: int, output: int) -> None:
         usage = {"output_tokens": output, "input_tokens": 1}
-        reader.read({"type": "assistant", "message": {"id": f"m{identity}", "usage": usage}})
+        reader.read_event({"type": "assistant", "message": {"id": f"m{identity}", "usage": usage}})
 
     for identity in range(100_000):
         report_usage(identity, 1)
@@ -182,11 +182,11 @@ def test_the_clock_stands_still_in_a_pause_and_for_hidden_episodes() -> None:
         now[0] = 1000.0
         assert clock.remaining_s() == 6.0
     now[0] = 1005.0
-    clock.held(3.0)
+    clock.set_held(3.0)
     assert (clock.remaining_s(), clock.used_s()) == (4.0, 6.0)
-    clock.held(2.0)
+    clock.set_held(2.0)
     assert clock.remaining_s() == 4.0
-    clock.held(5.0)
+    clock.set_held(5.0)
     now[0] = 1012.0
     assert clock.remaining_s() == -1.0
 
@@ -295,14 +295,14 @@ def test_an_event_counts_only_where_its_path_allows_it() -> None:
     )
     events = Events(error=("[type=result].error.message",), text=("[role=assistant].content",), tokens=paths)
     reader = ConfiguredReader(events)
-    reader.read({"type": "tool_result", "error": {"message": "no such file"}})
-    reader.read({"type": "message", "role": "user", "content": "the prompt"})
+    reader.read_event({"type": "tool_result", "error": {"message": "no such file"}})
+    reader.read_event({"type": "message", "role": "user", "content": "the prompt"})
     assert (reader.failure, reader.text) == (None, "")
-    reader.read({"type": "message", "role": "assistant", "content": "done"})
+    reader.read_event({"type": "message", "role": "assistant", "content": "done"})
     # Tokens beyond input and output are reasoning.
-    reader.read({"type": "result", "u": {"in": 10, "cached": 4, "out": 2, "all": 15}})
+    reader.read_event({"type": "result", "u": {"in": 10, "cached": 4, "out": 2, "all": 15}})
     assert (reader.text, reader.usage) == ("done", Usage(input_noncached=6, cache_read=4, output=5))
-    reader.read({"type": "result", "error": {"message": "429 too many requests"}})
+    reader.read_event({"type": "result", "error": {"message": "429 too many requests"}})
     assert reader.failure is not None
     event = {"a": [{"k": "x", "b": 1}, {"k": "y", "c": 2}, {"k": "y", "b": 3}], "d": {"e": "f"}}
     for path, expected in {"a.*.b": [1, 3], "a.*.[k=y].b": [3], "d.e": ["f"]}.items():

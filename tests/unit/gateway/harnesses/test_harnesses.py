@@ -172,7 +172,7 @@ def test_a_program_that_cannot_be_started_is_reported(tmp_path: Path) -> None:
         workspace=tmp_path / "missing", urls={}, environment={}, log=log, on_turn=lambda turn, text: None
     )
     with pytest.raises(AgentError, match="cannot start"):
-        asyncio.run(CommandHarness("command", ["/bin/true"]).play(stage))
+        asyncio.run(CommandHarness("command", ["/bin/true"]).run_agent(stage))
     log.close()
 
 

@@ -111,7 +111,7 @@ async def test_an_answer_of_another_form_is_an_error_that_says_so(api: ApiName, 
         known = Conversation({"api": api, "base_url": server.base_url, **KNOWN}, "")
         known.say("hello")
         with pytest.raises(ApiError, match="cannot be read"):
-            await known.ask()
+            await known.ask_model()
     # The conversation can go on.
     assert [message.kind for message in known.messages] == ["request"]
 
@@ -152,7 +152,7 @@ async def test_providers_words_for_a_conversation_that_is_too_long_are_known(tex
             known = Conversation({"api": "messages", "base_url": server.base_url, **KNOWN}, "")
             known.say("hello")
             with pytest.raises(ApiError, match=re.escape(text)) as raised:
-                await known.ask()
+                await known.ask_model()
         assert raised.value.too_long is (status == 400)
 
 

@@ -66,7 +66,7 @@ async def conversed(
         conversation = Conversation(settings, "key", kept)
         if not outputs:
             conversation.say("Go on.")
-        reply = await conversation.ask()
+        reply = await conversation.ask_model()
         outputs = len(reply.calls)
         if outputs:
             conversation.answer(reply.calls, ["an output"] * outputs)

@@ -21,14 +21,14 @@ from evopolicy_gateway.harnesses import make
 from evopolicy_gateway.harnesses.coding_agents.cli_agent import CliAgent
 from evopolicy_gateway.harnesses.interface.agent_config import AcpTable, AgentConfig, Cli
 from evopolicy_gateway.inputs import declared
-from evopolicy_gateway.inputs.declared import McpServer, read
+from evopolicy_gateway.inputs.declared import McpServer, read_inputs
 from evopolicy_gateway.inputs.kept import MCP_FILE, Kept, keep
 from evopolicy_gateway.run import plan
 
 
 def kept(folder: Path, place: Path) -> Kept:
     skills, servers = declare(folder)
-    expected = [each.recorded for each in read(skills, servers, folder)]
+    expected = [each.recorded for each in read_inputs(skills, servers, folder)]
     return keep(skills, servers, folder, place, expected)
 
 
@@ -37,7 +37,7 @@ def test_a_digest_depends_on_content_and_not_on_the_place(tmp_path: Path) -> Non
     for name in ("one", "two"):
         (tmp_path / name).mkdir()
         skills, servers = declare(tmp_path / name)
-        contents.append([each.recorded for each in read(skills, servers, tmp_path / name)])
+        contents.append([each.recorded for each in read_inputs(skills, servers, tmp_path / name)])
     assert contents[0] == contents[1]
     assert [(each.kind, each.name, each.hosts) for each in contents[0]] == [
         ("skill", "lamps", ()),
@@ -55,7 +55,7 @@ def test_every_byte_and_right_of_a_file_counts(tmp_path: Path, place: str, which
     digests = []
     for change in (lambda path: None, lambda path: path.write_text("x"), lambda path: path.chmod(0o700)):
         change(tmp_path / place)
-        digests.append([each.recorded.digest for each in read(skills, servers, tmp_path)])
+        digests.append([each.recorded.digest for each in read_inputs(skills, servers, tmp_path)])
     assert len({each[which] for each in digests}) == (2 if place.endswith(".sh") else 3)
     assert len({each[1 - which] for each in digests}) == 1
 
@@ -69,7 +69,7 @@ def test_a_servers_command_line_and_variables_belong_to_its_digest(tmp_path: Pat
         msgspec.structs.replace(first, environment={"UNIT": "candela"}),
         msgspec.structs.replace(first, command="sh"),
     ]
-    assert len({read((), {"lamp": each}, tmp_path)[0].recorded.digest for each in others}) == 4
+    assert len({read_inputs((), {"lamp": each}, tmp_path)[0].recorded.digest for each in others}) == 4
 
 
 FAULTS: dict[str, tuple[Callable[[Path], object], str]] = {
@@ -96,7 +96,7 @@ def test_a_skill_that_is_not_what_it_seems_is_refused(tmp_path: Path, fault: str
     change, message = FAULTS[fault]
     change(tmp_path / "skills" / "lamps")
     with pytest.raises(ConfigError, match=message):
-        read(skills, {}, tmp_path)
+        read_inputs(skills, {}, tmp_path)
 
 
 @pytest.mark.parametrize("path", ["../outside", "/etc", "skills/../../outside", "."])
@@ -105,7 +105,7 @@ def test_a_skill_outside_the_folder_of_the_command_is_refused(tmp_path: Path, pa
     (tmp_path / "outside" / "SKILL.md").touch()
     (tmp_path / "mine").mkdir()
     with pytest.raises(ConfigError, match="is not below"):
-        read([path], {}, tmp_path / "mine")
+        read_inputs([path], {}, tmp_path / "mine")
 
 
 def test_odd_servers_are_refused_with_the_entry(tmp_path: Path) -> None:
@@ -121,9 +121,9 @@ def test_odd_servers_are_refused_with_the_entry(tmp_path: Path) -> None:
         (McpServer(command="sh", hosts=("*.example.org",)), r"mcp\.lamp\.hosts"),
     ):
         with pytest.raises(ConfigError, match=message):
-            read((), {"lamp": server}, tmp_path / "mine")
+            read_inputs((), {"lamp": server}, tmp_path / "mine")
     with pytest.raises(ConfigError, match="the name"):
-        read((), {"the lamp": McpServer(command="sh")}, tmp_path)
+        read_inputs((), {"the lamp": McpServer(command="sh")}, tmp_path)
 
 
 def test_a_runs_own_copies_outlive_their_source(tmp_path: Path) -> None:
@@ -140,7 +140,7 @@ def test_a_runs_own_copies_outlive_their_source(tmp_path: Path) -> None:
 def test_inputs_that_change_while_a_run_is_open_are_refused_by_name(tmp_path: Path) -> None:
     place = tmp_path / "run"
     skills, servers = declare(tmp_path)
-    expected = [each.recorded for each in read(skills, servers, tmp_path)]
+    expected = [each.recorded for each in read_inputs(skills, servers, tmp_path)]
     keep(skills, servers, tmp_path, place, expected)
     copy = place / "skills" / "lamps" / "SKILL.md"
     copy.chmod(0o600)
@@ -170,7 +170,7 @@ def words_of(folder: Path, config: AgentConfig, options: str = "") -> list[str]:
     folder.mkdir()
     harness = make(config.harness, folder, config)
     assert isinstance(harness, CliAgent)
-    harness.take(kept(folder, folder / "run"))
+    harness.take_inputs(kept(folder, folder / "run"))
     return harness._dialect.arguments("s-1", resume=False, prompt="", options=options)
 
 
@@ -193,9 +193,9 @@ def test_codex_is_told_in_toml_whatever_the_characters(tmp_path: Path) -> None:
     odd = ("\U0001f642", "\x7f\x01\n", '"\\')
     server = McpServer(command="sh", args=odd, environment={"MY VALUE": odd[0], "DOTTED.NAME": odd[1]})
     config = AgentConfig(harness="codex", mcp={"lamp": server})
-    expected = [each.recorded for each in read((), config.mcp, tmp_path)]
+    expected = [each.recorded for each in read_inputs((), config.mcp, tmp_path)]
     harness = make("codex", tmp_path, config)
-    harness.take(keep((), config.mcp, tmp_path, tmp_path / "run", expected))
+    harness.take_inputs(keep((), config.mcp, tmp_path, tmp_path / "run", expected))
     assert isinstance(harness, CliAgent)
     words = harness._dialect.arguments(None, resume=False, prompt="", options="")
     document = tomllib.loads("\n".join(word for word in words if word.startswith("mcp_servers.lamp.")))
@@ -208,7 +208,7 @@ def test_a_name_that_is_not_utf8_is_refused_with_the_remedy(tmp_path: Path) -> N
     declare(tmp_path)
     Path(os.fsdecode(os.fsencode(tmp_path / "skills" / "lamps") + b"/\xff")).touch()
     with pytest.raises(ConfigError, match="is not UTF-8; rename the file"):
-        read(("skills/lamps",), {}, tmp_path)
+        read_inputs(("skills/lamps",), {}, tmp_path)
 
 
 def test_agents_that_cannot_be_told_of_servers_are_refused(tmp_path: Path) -> None:

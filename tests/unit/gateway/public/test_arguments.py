@@ -107,7 +107,7 @@ def test_a_folder_of_runs_is_a_path(path: Any) -> None:
 
 def test_numbers_of_numpy_are_taken_as_pythons() -> None:
     assert _arguments.taken(budget=np.int64(8), cases=np.arange(2)) == {"budget": 8, "cases": (0, 1)}
-    assert type(_arguments.take("budget", np.int64(8))) is int
+    assert type(_arguments.check_argument("budget", np.int64(8))) is int
 
 
 def test_every_argument_has_its_rule() -> None:
@@ -118,11 +118,11 @@ def test_every_argument_has_its_rule() -> None:
 
 def test_keywords_for_type_checkers_are_the_declared_options() -> None:
     paths = {Path: _arguments.AnyPath, ResourceLimits: Mapping[str, float] | None}
-    given = typing.get_type_hints(evp.RunOptions)
+    given = typing.get_type_hints(evp.RunKeywords)
     assert [*given] == [name for name in _arguments.OPTIONS if name != "agent"]
     for name, kind in given.items():
         declared = _arguments.OPTIONS[name].type
         optional = type(None) in typing.get_args(declared)
         plain = typing.get_args(declared)[0] if optional else declared
         assert kind == (paths.get(plain, plain) | None if optional else paths.get(plain, plain)), name
-        assert f"`{name}`: " in (evp.RunOptions.__doc__ or "")
+        assert f"`{name}`: " in (evp.RunKeywords.__doc__ or "")

@@ -26,7 +26,7 @@ from invented.run_dirs import write_run
 from evopolicy import load_runs
 from evopolicy._exports import tracking
 from evopolicy_common.records.blobs import write_atomically
-from evopolicy_common.records.suite_folder import Entry, Index
+from evopolicy_common.records.suite_folder import Index, SweepRun
 from evopolicy_gateway.suite.suite_index import save
 
 pytestmark = pytest.mark.system
@@ -308,7 +308,7 @@ def test_a_sweep_is_followed_to_its_end_and_shows_nothing_hidden_before(
 ) -> None:
     monkeypatch.setattr(tracking, "POLL_S", 0.05)
     runs = tmp_path / "runs"
-    entry = Entry(name="a", agent="Agent A", env="gym/acrobot", repeat=0, digest="0" * 64, state="running")
+    entry = SweepRun(name="a", agent="Agent A", env="gym/acrobot", repeat=0, digest="0" * 64, state="running")
     save(runs, Index(suite="s", runs={"a": entry}))
     run = write_run(runs, VERSIONS, heldout=(4.0, 6.0))
     (run / "logs").mkdir(exist_ok=True)

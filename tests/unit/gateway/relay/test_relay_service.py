@@ -353,7 +353,7 @@ def test_a_line_a_minute_has_requests_tokens_and_cost() -> None:
         slept.append(seconds)
         for _ in range(next(requests)):
             usage = Usage(input_noncached=1000, output=100)
-            used.take(Request(at=NOON, api="responses", asked="m", status=200, usage=usage))
+            used.count_request(Request(at=NOON, api="responses", asked="m", status=200, usage=usage))
 
     with pytest.raises(RuntimeError, match="StopIteration"):
         asyncio.run(tell(used, Prices(input=1000.0, output=10000.0), said.append, sleep))

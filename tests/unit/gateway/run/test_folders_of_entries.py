@@ -17,7 +17,7 @@ from evopolicy_common.records.run_record import encode_run_record
 from evopolicy_common.records.suite_folder import INDEX, PAUSED
 from evopolicy_gateway.run.plan import Plan, check_apart
 from evopolicy_gateway.run_folder.layout import run_folder, save
-from evopolicy_gateway.suite.suite_file import expand, read
+from evopolicy_gateway.suite.suite_file import expand, read_suite
 
 NAMES = (
     *("模型甲", "模型乙", "مثال", "देवनागरी", "café", "Ärger"),
@@ -91,13 +91,13 @@ def test_a_plan_refuses_names_that_share_a_folder(tmp_path: Path, names: tuple[s
     """On Linux too, whose folders may be copied to a system that ignores case."""
     (tmp_path / "s.toml").write_text(HEAD + "".join(map(EVOLVE.format, names)))
     with pytest.raises(ConfigError, match=rf"{names[0]}.*{names[1]}.*one folder"):
-        expand(read(os.fspath(tmp_path / "s.toml")), tmp_path, tmp_path)
+        expand(read_suite(os.fspath(tmp_path / "s.toml")), tmp_path, tmp_path)
 
 
 def test_a_plan_keeps_names_of_other_scripts_apart(tmp_path: Path) -> None:
     (tmp_path / "s.toml").write_text(
         HEAD + "".join(map(EVOLVE.format, ("模型甲", "模型乙", "gpt:5", "gpt?5")))
     )
-    runs = expand(read(os.fspath(tmp_path / "s.toml")), tmp_path, tmp_path)
+    runs = expand(read_suite(os.fspath(tmp_path / "s.toml")), tmp_path, tmp_path)
     assert len({run.folder.root for run in runs}) == 4
     check_apart(runs)

@@ -142,7 +142,7 @@ from evopolicy_gateway.harnesses.interface.base import Harness
 
 class Deaf(Harness):
     name, command = "deaf", []
-    async def play(self, stage):
+    async def run_agent(self, stage):
         await asyncio.sleep(1000)
 
 class Orders:

@@ -46,7 +46,7 @@ def plan(root: Path, start_from: str, exp_id: str = "second") -> Plan:
 def test_a_start_gets_the_recorded_workspace_and_no_hidden_result(parent: RunFolder, tmp_path: Path) -> None:
     started = plan(tmp_path, f"{RUN}@submit_000")
     assert started.settings.start is not None
-    assert started.settings.start.tree == trees.read(parent.root, "submit_000")[1]
+    assert started.settings.start.tree == trees.read_tree(parent.root, "submit_000")[1]
     started.claim()
     started.folder.state.mkdir()
     stage_start(find_start(started.start_from, tmp_path), started.folder)

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from evopolicy_common.errors import ConfigError, StorageError
 from evopolicy_common.records.open_run import (
     Accepted,
-    AnyEntry,
+    AnyLine,
     OpenedRun,
     Rejected,
     Requested,
@@ -24,7 +24,7 @@ from evopolicy_gateway.run_folder.layout import RunFolder, save, saved
 REQUESTED = Requested(
     key="k", client_key=None, body_digest="d", env_instances=(1, 2), bundle="b" * 64, bundle_error=None
 )
-ENTRIES: list[AnyEntry] = [
+ENTRIES: list[AnyLine] = [
     REQUESTED,
     Accepted(key="k", submit_index=0, first_global_episode=0, remaining_budget=3),
     Settled(key="k", status="ok", summary='{\n  "a": "é\u2028"\n}\n'),
@@ -32,7 +32,7 @@ ENTRIES: list[AnyEntry] = [
 ]
 
 
-def entries_in(path: Path) -> list[AnyEntry]:
+def entries_in(path: Path) -> list[AnyLine]:
     journal = Journal(path)
     journal.close()
     return list(journal.entries.values())
@@ -75,7 +75,7 @@ def test_a_line_is_read_again_from_its_place(tmp_path: Path) -> None:
     journal.close()
     journal = Journal(tmp_path / "j")
     assert list(journal.entries) == places
-    assert [journal.read(place) for place in places] == ENTRIES
+    assert [journal.read_line(place) for place in places] == ENTRIES
     journal.close()
 
 

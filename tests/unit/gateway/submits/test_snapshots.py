@@ -10,7 +10,7 @@ import pytest
 
 from evopolicy_common.records.blobs import BlobStore
 from evopolicy_common.records.policies.bundles import MAX_BYTES, load
-from evopolicy_gateway.submits.snapshots import take
+from evopolicy_gateway.submits.snapshots import take_snapshot
 
 
 def system(tmp_path: Path) -> Path:
@@ -22,10 +22,10 @@ def system(tmp_path: Path) -> Path:
 
 def test_a_snapshot_is_stored_under_its_digest(tmp_path: Path) -> None:
     blobs = BlobStore(tmp_path / "blobs")
-    taken = take(system(tmp_path), blobs)
+    taken = take_snapshot(system(tmp_path), blobs)
     assert taken.error is None
     assert taken.digest is not None
-    assert [file.path for file in load(blobs.read(taken.digest), taken.digest).files] == ["policy.py"]
+    assert [file.path for file in load(blobs.read_blob(taken.digest), taken.digest).files] == ["policy.py"]
 
 
 def remove(folder: Path) -> None:
@@ -82,7 +82,7 @@ def test_a_folder_that_cannot_be_a_bundle_has_a_verdict(
 ) -> None:
     folder = system(tmp_path)
     spoil(folder)
-    taken = take(folder, BlobStore(tmp_path / "blobs"))
+    taken = take_snapshot(folder, BlobStore(tmp_path / "blobs"))
     assert taken.digest is None
     assert taken.error is not None
     assert taken.error.category == category

@@ -18,7 +18,7 @@ from evopolicy_common.messages.gateway import RunState, SubmitAccepted, SubmitDo
 from evopolicy_common.records.blobs import digest_of
 from evopolicy_common.records.open_run import (
     Accepted,
-    AnyEntry,
+    AnyLine,
     Died,
     Refused,
     Rejected,
@@ -57,7 +57,7 @@ class World:
 
     def __init__(self, profile: str) -> None:
         self.profile = profile
-        self.journal: list[AnyEntry] = []
+        self.journal: list[AnyLine] = []
         self.accepted: dict[str, SubmitAccepted] = {}
         self.sent: dict[str, Requested] = {}
         self.heard: list[RunState] = []
@@ -95,7 +95,7 @@ class World:
         before = self.machine.in_flight
         self.n_asked += 1
         try:
-            self.machine.ask(body, client_key, f"key-{self.n_asked}")
+            self.machine.open_ticket(body, client_key, f"key-{self.n_asked}")
         except RequestError as refusal:
             self.refusals.append((type(refusal), before))
             if (entry := self.machine.reject(refusal, 0.0)) is not None:
@@ -249,7 +249,7 @@ def test_submits_survive_any_order_of_requests_errors_and_crashes(
 BUGS = {
     "a key answers for another body": ("repeated", "ticket.request.body_digest != digest_of(body)", "False"),
     "a key is forgotten": ("repeated", "next(keyed, None)", "None"),
-    "two submits at once": ("ask", "self.in_flight is not None", "False"),
+    "two submits at once": ("open_ticket", "self.in_flight is not None", "False"),
     "sent before it is journalled": ("next", "self.in_flight.requested_at is None", "False"),
     "sent after it is accepted": ("next", "self.in_flight.accepted is None", "True"),
     "journalled without its bundle": ("snapshotted", "bundle=snapshot.digest", "bundle=None"),

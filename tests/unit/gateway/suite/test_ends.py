@@ -16,12 +16,12 @@ from rigs.finished_run import finished, plan_in, record_in
 from evopolicy_common.console import Terminal
 from evopolicy_common.messages.run_settings import RunSettings
 from evopolicy_common.records.run_record import RunRecord
-from evopolicy_common.records.suite_folder import Entry, Index
+from evopolicy_common.records.suite_folder import Index, SweepRun
 from evopolicy_gateway.run.plan import Plan
 from evopolicy_gateway.run.times import Times
 from evopolicy_gateway.suite import suite_index
 from evopolicy_gateway.suite.runs import PlayedRuns, documents, report
-from evopolicy_gateway.suite.suite_file import expand, read
+from evopolicy_gateway.suite.suite_file import expand, read_suite
 from evopolicy_gateway.suite.suite_index import entry_of, exit_code
 from evopolicy_results.statistics.intervals import difference
 
@@ -93,7 +93,7 @@ NEVER_PLAYED = {
 def one_run(root: Path, **fields: Any) -> tuple[Plan, RunRecord]:
     path = root / "s.toml"
     path.write_text(FILE)
-    (plan,) = expand(read(str(path)), root / "runs", root)
+    (plan,) = expand(read_suite(str(path)), root / "runs", root)
     for index in range(3):
         (plan.folder.checkpoints / f"submit_{index:03d}").mkdir(parents=True)
     return plan, record_in(plan, finished(settings=plan.settings, **fields), times=Times(open_s=9.0))
@@ -186,7 +186,7 @@ def test_exit_codes_and_report_tell_the_ends(tmp_path: Path, capsys: pytest.Capt
         settings = RunSettings(env=name, entry="evolve", model="none", exp_id="t")
         plans.append(plan_in(tmp_path, settings))
         more = {"agent": "evolve", "env": name, "repeat": 0, "digest": "", "directory": f"evolve/{name}/t"}
-        index.runs[name] = Entry(name=name, **more | status)
+        index.runs[name] = SweepRun(name=name, **more | status)
         assert exit_code(plans, index) == code
         # Whatever is no success is explained where nobody has to look for it.
         printed = capsys.readouterr().err.splitlines()

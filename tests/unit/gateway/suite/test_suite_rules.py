@@ -25,7 +25,7 @@ from evopolicy_gateway.suite.decisions import (
     lines,
     side_by_side,
 )
-from evopolicy_gateway.suite.suite_file import check_agents_start, expand, read
+from evopolicy_gateway.suite.suite_file import check_agents_start, expand, read_suite
 from evopolicy_gateway.suite.suite_index import used
 
 FILE = """
@@ -59,7 +59,7 @@ JAIL = '[agents.jail]\nhosts = ["h"]\n'
 def suite_in(tmp_path: Path, text: str = FILE) -> list[Plan]:
     path = tmp_path / "s.toml"
     path.write_text(text)
-    return expand(read(str(path)), tmp_path / "runs", tmp_path)
+    return expand(read_suite(str(path)), tmp_path / "runs", tmp_path)
 
 
 def test_runs_are_agents_times_environments_times_repeats_with_overrides(tmp_path: Path) -> None:
@@ -138,7 +138,7 @@ SHIPPED = ["smoke.toml", "core16.toml", "core16-paper.toml", "core16-published.t
 @pytest.mark.parametrize("name", SHIPPED)
 def test_shipped_suites_are_whole(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("ANTHROPIC_AUTH_TOKEN", "set")
-    suite = read(name)
+    suite = read_suite(name)
     runs = expand(suite, tmp_path, tmp_path)
     core16 = catalogue.resolve(["core16"])
     assert len(runs) == len(suite.agents) * 16
@@ -292,7 +292,7 @@ PLACES = st.tuples(st.sampled_from("abcd"), st.sampled_from(["shared", "per_run"
 
 
 def waiting(places: list[tuple[str, str]]) -> list[Decision]:
-    run = expand(read("smoke"), Path(), Path())[0]
+    run = expand(read_suite("smoke"), Path(), Path())[0]
     return [
         Decision(
             run=msgspec.structs.replace(

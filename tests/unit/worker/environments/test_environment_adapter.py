@@ -213,5 +213,7 @@ def test_only_what_plays_an_environment_is_in_its_adapters_digest(monkeypatch: p
     monkeypatch.setattr(Path, "read_bytes", noted)
     fingerprint._digest.cache_clear()
     fingerprint.adapter(type(box2d.FAMILY), 1, "CarRacing-v3")
-    assert {"box2d.py", "loop.py", "player.py", "car_racing_road.py", "gymnasium_adapter.py"} <= set(read)
+    assert {"box2d.py", "loop.py", "policy_server.py", "car_racing_road.py", "gymnasium_adapter.py"} <= set(
+        read
+    )
     assert not {"mujoco.py", "registry.py", "highway_lanes.py", "table.py"} & set(read)

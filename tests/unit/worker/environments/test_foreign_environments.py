@@ -24,7 +24,7 @@ from evopolicy_worker.environments.interface.gymnasium_adapter import GymnasiumF
 from evopolicy_worker.environments.interface.spaces import compile_checker
 from evopolicy_worker.environments.interface.trial import solved
 from evopolicy_worker.episodes.frames import compile_writer
-from evopolicy_worker.sandbox.inside import player
+from evopolicy_worker.sandbox.inside import policy_server
 
 PACKAGE = Path(__file__).parents[3] / "support" / "foreign_package"
 
@@ -210,7 +210,7 @@ def received(environment: Environment, obs: Any, *, as_lists: bool) -> Any:
     """The observation as the policy's process reads it from the bytes that are sent."""
     space = json.loads(json.dumps(environment.description.obs_space))
     data = b"".join(map(bytes, compile_writer(space)(obs)))
-    _, read = player.observation_reader(space, as_lists)
+    _, read = policy_server.observation_reader(space, as_lists)
     return read(bytearray(data), len(data))
 
 

@@ -238,7 +238,7 @@ def test_an_environment_that_hangs_on_actions_gives_no_second_throw(
         for _ in range(2):
             slots.run(slot.start())
             with pytest.raises(WorkerError, match=r"environment acme/Bad, .*step.*: it has not returned"):
-                slots.run(slot.play(job, bundle, lambda *progress: None))
+                slots.run(slot.play_job(job, bundle, lambda *progress: None))
             job = going_on(job, slot)
             stands.append(prefix(job))
         # The clock gave the policy no second throw.
@@ -246,7 +246,7 @@ def test_an_environment_that_hangs_on_actions_gives_no_second_throw(
         assert stands[0] == stands[1]
         slots.run(slot.start())
         job = msgspec.structs.replace(job, environment_faults=AGAIN)
-        (outcome,) = slots.run(slot.play(job, bundle, lambda *progress: None))
+        (outcome,) = slots.run(slot.play_job(job, bundle, lambda *progress: None))
         assert outcome.failure is not None
         assert (outcome.failure.category, outcome.length) == ("killed", 8)
     finally:

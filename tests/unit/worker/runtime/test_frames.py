@@ -19,7 +19,7 @@ from evopolicy_common.seccomp import NUMBERS
 from evopolicy_worker.episodes import frames
 from evopolicy_worker.episodes.monitor import Output
 from evopolicy_worker.sandbox import seccomp
-from evopolicy_worker.sandbox.inside import player
+from evopolicy_worker.sandbox.inside import policy_server
 
 SPACE: dict[str, Any] = {
     "type": "Dict",
@@ -46,7 +46,7 @@ def test_observations_arrive_as_they_were_sent(first: str, second: str, number: 
         "e": second,
     }
     payload = b"".join(bytes(part) for part in frames.compile_writer(SPACE)(obs))
-    make_buffer, read = player.observation_reader(SPACE, False)
+    make_buffer, read = policy_server.observation_reader(SPACE, False)
     buffer = make_buffer()
     if len(buffer) < len(payload):
         buffer = bytearray(len(payload))
@@ -102,7 +102,7 @@ def test_hostile_replies_are_an_action_or_refused_and_nothing_else(tag: int, pay
     ],
 )
 def test_impossible_arrays_nests_keys_and_timestamps_are_refused(payload: bytes) -> None:
-    for tag in (player.ARRAY, player.GENERIC):
+    for tag in (policy_server.ARRAY, policy_server.GENERIC):
         with pytest.raises(frames.BadReplyError):
             frames.action(tag, payload)
 
@@ -121,8 +121,8 @@ def test_impossible_arrays_nests_keys_and_timestamps_are_refused(payload: bytes)
 )
 def test_both_ends_count_an_action_alike(action: Any) -> None:
     try:
-        frame = player.encoded(action)
-    except player.TooLargeError:
+        frame = policy_server.encoded(action)
+    except policy_server.TooLargeError:
         return
     got = frames.action(frame[4], frame[8:])
     assert len(json_bytes(got)) <= 8 * len(frame) + 100
@@ -151,7 +151,7 @@ def test_an_action_that_cannot_be_sent_is_reported() -> None:
         *(np.zeros(1025, np.float16), [np.zeros(600, np.bool_)] * 2, {"a": np.empty((1025, 0))}),
     ):
         with pytest.raises(ValueError, match="the action"):
-            player.encoded(action)
+            policy_server.encoded(action)
 
 
 CHECKED = {
@@ -281,5 +281,5 @@ def test_output_beyond_its_limit_is_read_and_dropped() -> None:
     os.close(writing)
     output.drain()
     assert not output.open
-    assert output.take() == b"1234567890"
+    assert output.take_output() == b"1234567890"
     os.close(reading)

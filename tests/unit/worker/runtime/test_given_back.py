@@ -57,7 +57,7 @@ async def stopped(
         if episodes_done >= episodes and n_steps >= steps:
             reached.set()
 
-    task = asyncio.create_task(slot.play(job, slots.bundle(source), on_progress))
+    task = asyncio.create_task(slot.play_job(job, slots.bundle(source), on_progress))
     await asyncio.wait({task, asyncio.create_task(reached.wait())}, return_when=asyncio.FIRST_COMPLETED)
     await slot.cancel()
     return await asyncio.wait_for(task, 60)
@@ -70,7 +70,7 @@ def begin(slots: Slots, slot: Slot, job: Job, source: str, steps: int, episodes:
 
 
 def end(slots: Slots, slot: Slot, job: Job, source: str) -> tuple[EpisodeOutcome, ...]:
-    return slots.run(slot.play(job, slots.bundle(source), lambda *progress: None))
+    return slots.run(slot.play_job(job, slots.bundle(source), lambda *progress: None))
 
 
 def actions(outcome: EpisodeOutcome) -> list[float]:
@@ -111,7 +111,7 @@ def test_actions_stand_when_the_process_of_the_environment_is_killed(slots: Slot
         assert slot._process is not None
         reached = asyncio.Event()
         playing = asyncio.create_task(
-            slot.play(job, slots.bundle(SLOW), lambda _, n: reached.set() if n >= steps else None)
+            slot.play_job(job, slots.bundle(SLOW), lambda _, n: reached.set() if n >= steps else None)
         )
         await reached.wait()
         os.killpg(slot._process.pid, signal.SIGKILL)
@@ -177,7 +177,7 @@ def test_begun_actions_exist_only_for_returned_hidden_actions(slots: Slots) -> N
     slot = slots.slot()
 
     async def at_once(job: Job, source: str) -> None:
-        task = asyncio.create_task(slot.play(job, slots.bundle(source), lambda *progress: None))
+        task = asyncio.create_task(slot.play_job(job, slots.bundle(source), lambda *progress: None))
         await asyncio.sleep(1.0)
         await slot.cancel()
         assert await task == ()
@@ -208,7 +208,7 @@ def test_the_file_of_an_episode_holds_actions_of_any_form_and_length(
     values = [*odd, *[[0.1] * 999] * 99]
     log.begins("job", 2, episode)
     for value in values:
-        episode.take(begun.Returned(value, value))
+        episode.add_action(begun.Returned(value, value))
     assert begun.recovered(tmp_path, "other") == {}
     again = begun.recovered(tmp_path, "job")[2].unpacked()
     kept: list[Any] = [3, [0, 1, 2], {"a": [0.5, "x"]}, "\\ud800", 2**70, *values[4:]]
@@ -224,7 +224,7 @@ def test_the_file_of_an_episode_holds_actions_of_any_form_and_length(
     episode = begun.Begun()
     log.begins("job", 0, episode)
     for number in range(600_000):
-        episode.take(begun.Returned(number, number))
+        episode.add_action(begun.Returned(number, number))
     found = begun.recovered(tmp_path, "job")[0].unpacked().taken
     assert [each.action for each in found] == [*range(len(found))]
     assert 50_000 < len(found) < 600_000

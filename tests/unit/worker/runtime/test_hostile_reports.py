@@ -31,12 +31,12 @@ from evopolicy_worker import environments
 from evopolicy_worker.environments.families.toy import Line
 from evopolicy_worker.environments.interface.actions import compile_actions
 from evopolicy_worker.episodes import frames
-from evopolicy_worker.episodes.loop import Player, _blob
+from evopolicy_worker.episodes.loop import JobPlayer, _blob
 from evopolicy_worker.episodes.monitor import Monitor
 from evopolicy_worker.episodes.policies import Progress
 from evopolicy_worker.episodes.policy_process import PolicyProcess
 from evopolicy_worker.sandbox import jail
-from evopolicy_worker.sandbox.inside import player as shim
+from evopolicy_worker.sandbox.inside import policy_server as shim
 from evopolicy_worker.sandbox.zygote import Zygote
 from evopolicy_worker.slot_protocol import slot_messages as messages
 from evopolicy_worker.slots.slot import bundle_files
@@ -273,13 +273,13 @@ BREAKER = misbehaving(act="return [1.0]")
 
 
 @pytest.fixture
-def player(tmp_path: Path, monitor: Monitor, monkeypatch: pytest.MonkeyPatch) -> Iterator[Player]:
+def player(tmp_path: Path, monitor: Monitor, monkeypatch: pytest.MonkeyPatch) -> Iterator[JobPlayer]:
     toy = environments.make("toy/line")
     monkeypatch.setattr(environments, "make", lambda env_id, **options: Fragile.__new__(Fragile))
     monkeypatch.setattr(Fragile, "__new__", lambda cls: _like(cls, toy))
     plan = jail.plan("none", tmp_path, ("numpy",))
     zygote = Zygote(plan, tmp_path)
-    yield Player(zygote, plan, monitor, tmp_path)
+    yield JobPlayer(zygote, plan, monitor, tmp_path)
     zygote.close()
 
 
@@ -289,18 +289,18 @@ def _like(cls: Any, toy: Any) -> Any:
     return made
 
 
-def play(player: Player, slots: Slots, source: str, n: int = 1, **options: Any) -> list[EpisodeOutcome]:
+def play(player: JobPlayer, slots: Slots, source: str, n: int = 1, **options: Any) -> list[EpisodeOutcome]:
     job = make_job(tier="none", n=n, **options)
     outcomes: list[EpisodeOutcome] = []
     bundle = bundle_files(slots.bundle(source))
-    last = player.play(job, bundle, Progress(), lambda frame: outcomes.extend(finished(frame)))
+    last = player.play_job(job, bundle, Progress(), lambda frame: outcomes.extend(finished(frame)))
     outcomes.extend(finished(last))
     return outcomes
 
 
 @pytest.mark.parametrize("how", ["raise", "infinite reward"])
 def test_an_action_that_breaks_the_environment_is_the_policys_failure(
-    player: Player, slots: Slots, monkeypatch: pytest.MonkeyPatch, how: str
+    player: JobPlayer, slots: Slots, monkeypatch: pytest.MonkeyPatch, how: str
 ) -> None:
     monkeypatch.setattr(Fragile, "how", how)
     (outcome,) = play(player, slots, BREAKER)
@@ -316,7 +316,7 @@ def test_an_action_that_breaks_the_environment_is_the_policys_failure(
 
 
 def test_failures_before_the_first_action_are_ours(
-    player: Player, slots: Slots, monkeypatch: pytest.MonkeyPatch
+    player: JobPlayer, slots: Slots, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(Fragile, "how", "disk")
     with pytest.raises(OSError, match="No space left"):
@@ -331,7 +331,7 @@ def test_failures_before_the_first_action_are_ours(
 
 
 def test_an_environment_that_breaks_without_a_policy_is_ours(
-    player: Player, slots: Slots, monkeypatch: pytest.MonkeyPatch
+    player: JobPlayer, slots: Slots, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def step(self: Fragile, action: Any) -> Any:
         raise RuntimeError("broken anyway")
@@ -342,7 +342,7 @@ def test_an_environment_that_breaks_without_a_policy_is_ours(
         play(player, slots, BREAKER)
 
 
-def test_after_a_broken_environment_the_jobs_other_episodes_go_on(player: Player, slots: Slots) -> None:
+def test_after_a_broken_environment_the_jobs_other_episodes_go_on(player: JobPlayer, slots: Slots) -> None:
     source = misbehaving(act="return [1.0]").replace(
         "self.n += 1", "self.n += 1; first = getattr(self, 'e', 0) == 1"
     )
@@ -364,7 +364,9 @@ def test_an_answer_of_a_slots_process_that_is_none_is_reported(slots: Slots) -> 
         assert process.stdout is not None
         process.stdout.feed_data(messages.LENGTH.pack(3) + b"abc")
         with pytest.raises(WorkerError, match="cannot be read"):
-            await slot.play(make_job(bundle=None, n=200, policy_scope="submit"), None, lambda *progress: None)
+            await slot.play_job(
+                make_job(bundle=None, n=200, policy_scope="submit"), None, lambda *progress: None
+            )
         await slot.close()
 
     slots.run(work())

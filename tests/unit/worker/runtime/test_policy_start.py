@@ -44,8 +44,8 @@ LOOKS = acting(
 
 
 @pytest.fixture(scope="module")
-def player() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("_player_here", INSIDE / "player.py")
+def policy_server() -> ModuleType:
+    spec = importlib.util.spec_from_file_location("_policy_server_here", INSIDE / "policy_server.py")
     assert spec is not None
     assert spec.loader is not None
     found = importlib.util.module_from_spec(spec)
@@ -67,15 +67,15 @@ def player() -> ModuleType:
     ],
 )
 def test_a_policys_generators_begin_as_numpy_seeds_them(
-    player: ModuleType, seed: bytes, copies: bool, monkeypatch: pytest.MonkeyPatch
+    policy_server: ModuleType, seed: bytes, copies: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     kept = random.getstate(), np.random.get_state(), np.random.bit_generator.randbits  # type: ignore[attr-defined]
     try:
-        player.find_numpy_key()
-        assert player.numpy_key
+        policy_server.find_numpy_key()
+        assert policy_server.numpy_key
         if not copies:
-            monkeypatch.setattr(player, "numpy_key", 0)
-        player.seed_generators(seed)
+            monkeypatch.setattr(policy_server, "numpy_key", 0)
+        policy_server.seed_generators(seed)
         found = np.random.standard_normal(3).tolist(), np.random.randint(1 << 30, size=3).tolist()
         np.random.seed(list(struct.unpack("<4I", seed[:16])))
         assert found == (np.random.standard_normal(3).tolist(), np.random.randint(1 << 30, size=3).tolist())

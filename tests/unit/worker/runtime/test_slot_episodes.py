@@ -15,7 +15,7 @@ from evopolicy_common.messages.environment import Case
 from evopolicy_common.processes.proc import descendants
 from evopolicy_worker import environments
 from evopolicy_worker.episodes.loop import random_actions
-from evopolicy_worker.sandbox.inside.player import reset_floats
+from evopolicy_worker.sandbox.inside.policy_server import reset_floats
 from evopolicy_worker.sandbox.jail import ENVIRONMENT
 
 TIERS = ("bwrap", "landlock", "none")
@@ -274,14 +274,15 @@ def test_modules_and_data_of_the_bundle_are_there_and_writable(slots: Slots) -> 
                     data = Path("data/weights.bin").read_bytes()
                     Path("data/weights.bin").write_bytes(data + b"!")
                     Path("/tmp/note").write_text("mine")
-                    print(GAIN, player.NAME, Path("data/weights.bin").read_bytes(), Path("/tmp/note").read_text())
+                    weights = Path("data/weights.bin").read_bytes()
+                    print(GAIN, policy_server.NAME, weights, Path("/tmp/note").read_text())
                 """,
-                before="from pathlib import Path; from helpers.gains import GAIN; import player",
+                before="from pathlib import Path; from helpers.gains import GAIN; import policy_server",
             )
         ),
         "helpers/__init__.py": "",
         "helpers/gains.py": "GAIN = 3",
-        "player.py": "NAME = 'a module of mine'",
+        "policy_server.py": "NAME = 'a module of mine'",
         "data/weights.bin": b"\x00\xff",
     }
     outcome = slots.play(files)

@@ -30,7 +30,7 @@ def test_a_cancelled_job_returns_at_once_and_the_slot_plays_the_next(slots: Slot
         assert await asyncio.wait_for(task, 5) == ()
         assert pid_of(slot) == pid
         await slot.cancel()  # nothing runs: no effect
-        return await slot.play(make_job(), slots.bundle(HONEST), lambda episodes, steps: None)
+        return await slot.play_job(make_job(), slots.bundle(HONEST), lambda episodes, steps: None)
 
     (outcome,) = slots.run(work())
     assert outcome.failure is None
@@ -41,7 +41,7 @@ def test_an_episode_of_random_actions_can_be_cancelled_too(slots: Slots) -> None
 
     async def work() -> None:
         job = make_job(bundle=None, n=20_000, policy_scope="submit")
-        task = asyncio.create_task(slot.play(job, None, lambda episodes, steps: None))
+        task = asyncio.create_task(slot.play_job(job, None, lambda episodes, steps: None))
         await asyncio.sleep(0.2)
         await slot.cancel()
         assert await asyncio.wait_for(task, 10) == ()
@@ -55,7 +55,7 @@ def test_progress_is_reported_while_a_job_runs(slots: Slots) -> None:
     policy = HONEST.replace("return [", "import time; time.sleep(0.01); return [")
     slot = slots.slot()
     job = make_job(n=2, policy_scope="submit")
-    slots.run(slot.play(job, slots.bundle(policy), lambda *progress: reports.append(progress)))
+    slots.run(slot.play_job(job, slots.bundle(policy), lambda *progress: reports.append(progress)))
     assert reports == sorted(reports)
     assert any(0 < steps < 120 for _, steps in reports)
     assert any(done == 1 for done, _ in reports)
@@ -75,7 +75,7 @@ def test_a_dead_slot_process_is_reported_and_restarted(slots: Slots, victim: str
             await asyncio.wait_for(task, 30)
         await slot.start()
         assert not [pid for pid in members if runs(pid)]
-        return await slot.play(make_job(), slots.bundle(HONEST), lambda episodes, steps: None)
+        return await slot.play_job(make_job(), slots.bundle(HONEST), lambda episodes, steps: None)
 
     (outcome,) = slots.run(work())
     assert outcome.failure is None
@@ -137,7 +137,7 @@ def test_without_an_own_file_system_the_policys_folder_is_removed(slots: Slots) 
 
 def test_a_slot_that_was_not_started_says_so(slots: Slots) -> None:
     with pytest.raises(WorkerError, match="not started"):
-        slots.run(slots.new().play(make_job(), None, lambda episodes, steps: None))
+        slots.run(slots.new().play_job(make_job(), None, lambda episodes, steps: None))
 
 
 def test_a_job_of_another_tier_is_never_played_in_this_one(slots: Slots) -> None:

@@ -220,7 +220,7 @@ def test_a_traceback_shows_the_policys_lines_and_no_folder_of_the_worker(slots: 
     assert failure is not None
     assert 'File "system/policy.py", line 16, in act' in failure.traceback
     assert "json/__init__.py" in failure.traceback
-    assert "player.py" not in failure.traceback
+    assert "policy_server.py" not in failure.traceback
     assert "/home/" not in failure.traceback
     assert str(slots.folder) not in failure.traceback
 

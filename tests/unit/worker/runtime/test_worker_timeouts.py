@@ -129,7 +129,7 @@ def test_a_slot_that_does_not_heed_a_cancel_is_ended(slots: Slots, monkeypatch: 
 
     async def cancelled() -> None:
         playing = asyncio.create_task(
-            own.play(make_job(bundle=None, tier="none"), None, lambda episodes, steps: None)
+            own.play_job(make_job(bundle=None, tier="none"), None, lambda episodes, steps: None)
         )
         while own._idle.is_set():
             await asyncio.sleep(0)

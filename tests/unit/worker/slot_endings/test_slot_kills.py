@@ -153,7 +153,7 @@ def test_an_episode_under_kills_and_stops_of_anything_is_the_same_episode(slots:
             try:
                 if slot._process is None:
                     await slot.start()
-                outcomes += await slot.play(
+                outcomes += await slot.play_job(
                     make_job(limits=PATIENT), slots.bundle(SLOW), lambda *progress: None
                 )
             except (SandboxError, WorkerError):

@@ -98,7 +98,7 @@ class CheckResult(msgspec.Struct, kw_only=True):
         return "; ".join(wrong) or "ok"
 
 
-def play(env_id: str, steps: int) -> CheckResult:
+def play_checked(env_id: str, steps: int) -> CheckResult:
     """Plays an environment in this process, at most `steps` steps per episode. Exceptions become faults."""
     played = CheckResult(env=env_id)
     try:
@@ -240,7 +240,7 @@ def _in_child(env_id: str, steps: int) -> CheckResult:
                 null = os.open(os.devnull, os.O_WRONLY)
                 os.dup2(null, 1)
                 os.dup2(null, 2)
-                out.write(msgspec.json.encode(play(env_id, steps)))
+                out.write(msgspec.json.encode(play_checked(env_id, steps)))
         finally:
             try:
                 _kill(proc.descendants(os.getpid()))  # fails if the environment allows no more files

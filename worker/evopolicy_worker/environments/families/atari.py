@@ -31,7 +31,7 @@ class AtariFamily(GymnasiumFamily):
         plain.pop("frame_number", None)
         return plain
 
-    def words(self, entry: Entry, env: Any) -> dict[str, str]:
+    def task_sections(self, entry: Entry, env: Any) -> dict[str, str]:
         console = env.unwrapped
         settings: dict[str, Any] = {} if console.spec is None else console.spec.kwargs
         choices = ((f"`{k}`", _choice(each)) for k, each in enumerate(console.get_action_meanings()))

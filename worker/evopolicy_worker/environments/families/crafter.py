@@ -41,7 +41,7 @@ class CrafterFamily(GymnasiumFamily):
     def make(self, entry: Entry, *, render: bool) -> Any:
         return _Game()
 
-    def words(self, entry: Entry, env: Any) -> dict[str, str]:
+    def task_sections(self, entry: Entry, env: Any) -> dict[str, str]:
         from crafter import constants
 
         choices = ((f"`{k}`", _choice(name)) for k, name in enumerate(constants.actions))

@@ -48,13 +48,17 @@ class DmControlFamily(MujocoFamily):
         check_rendering(entry, render=render)
         return _Task(*_names(entry))
 
-    def words(self, entry: Entry, env: Any) -> dict[str, str]:
+    def task_sections(self, entry: Entry, env: Any) -> dict[str, str]:
         domain, task = _names(entry)
         texts = template.load("dm_control_tasks.toml")[domain]
         objective, reward = texts["tasks"][task]
         parts = texts["observation"] | texts.get("also", {})
         rows = (
-            (f"`{name}`", parts[name].replace("{joints}", env.joints), template.words(spaces.to_schema(part)))
+            (
+                f"`{name}`",
+                parts[name].replace("{joints}", env.joints),
+                template.space_text(spaces.to_schema(part)),
+            )
             for name, part in env.observation_space.spaces.items()
         )
         bounds = zip(env.actuators, env.action_space.low, env.action_space.high, strict=True)

@@ -43,8 +43,8 @@ class HighwayFamily(GymnasiumFamily):
             plain["rewards"] = {name: float(value) for name, value in plain["rewards"].items()}
         return plain
 
-    def words(self, entry: Entry, env: gymnasium.Env[Any, Any]) -> dict[str, str]:
-        return highway.words(env.unwrapped)
+    def task_sections(self, entry: Entry, env: gymnasium.Env[Any, Any]) -> dict[str, str]:
+        return highway.task_sections(env.unwrapped)
 
 
 FAMILY = HighwayFamily()

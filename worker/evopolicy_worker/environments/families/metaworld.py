@@ -33,7 +33,7 @@ class MetaWorldFamily(MujocoFamily):
         check_rendering(entry, render=render)
         return _Tasks(_names(entry), render=render)
 
-    def words(self, entry: Entry, env: Any) -> dict[str, str]:
+    def task_sections(self, entry: Entry, env: Any) -> dict[str, str]:
         tasks = template.load("metaworld_tasks.toml")
         names = _names(entry)
         if len(names) == 1:

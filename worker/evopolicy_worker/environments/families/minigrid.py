@@ -29,7 +29,7 @@ class MiniGridFamily(GymnasiumFamily):
             space.spaces["mission"] = spaces.Text(_MISSION_CHARACTERS, charset=characters)
         return env
 
-    def words(self, entry: Entry, env: gymnasium.Env[Any, Any]) -> dict[str, str]:
+    def task_sections(self, entry: Entry, env: gymnasium.Env[Any, Any]) -> dict[str, str]:
         grid: Any = env.unwrapped
         return {
             "Start": f"The grid is {grid.width} × {grid.height} cells, with walls around it that are part of it."

@@ -48,7 +48,7 @@ class MiniWoBFamily(GymnasiumFamily):
         made: gymnasium.Env[Any, Any] = kind(self._page(entry), **entry.kwargs, render_mode=mode)
         return made
 
-    def words(self, entry: Entry, env: gymnasium.Env[Any, Any]) -> dict[str, str]:
+    def task_sections(self, entry: Entry, env: gymnasium.Env[Any, Any]) -> dict[str, str]:
         """The package's documentation of the page, without a reward's formula, and examples of its instructions."""
         page = miniwob_pages.texts().get(self._page(entry), miniwob_pages.PageText())
         examples = "\n".join(f"* {each}" for each in page.examples)

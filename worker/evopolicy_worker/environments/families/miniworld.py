@@ -58,7 +58,7 @@ class MiniWorldFamily(GymnasiumFamily):
         version = f"{gl_info.get_version()} {gl_info.get_renderer()}"[:120]
         return super().packages(entry) | {"opengl": version}
 
-    def words(self, entry: Entry, env: Any) -> dict[str, str]:
+    def task_sections(self, entry: Entry, env: Any) -> dict[str, str]:
         name, texts = str(entry.gymnasium_id).split("-")[1], template.load("miniworld_rooms.toml")
         meanings = (*_ACTIONS[:3], "end the episode") if name == "Sign" else _ACTIONS[: env.action_space.n]
         choices = ((f"`{k}`", meaning) for k, meaning in enumerate(meanings))

@@ -32,10 +32,10 @@ class MoGymnasiumFamily(MujocoFamily):
         usual = partial(super().make, entry, render=render)
         return _MadeFromSeed(usual) if str(entry.gymnasium_id).startswith("minecart") else usual()
 
-    def words(self, entry: Entry, env: Any) -> dict[str, str]:
+    def task_sections(self, entry: Entry, env: Any) -> dict[str, str]:
         scalarisation = rewards.Scalarisation.of(entry, env)
         assert scalarisation is not None
-        sections = highway.words(env.unwrapped) if "highway" in str(entry.gymnasium_id) else {}
+        sections = highway.task_sections(env.unwrapped) if "highway" in str(entry.gymnasium_id) else {}
         components = scalarisation.texts(entry.reward_components)
         return sections | {"Reward": template.reward_table(components, vector=True)}
 

@@ -58,10 +58,10 @@ class NetHackFamily(GymnasiumFamily):
     def needs(self) -> str:
         return f"{super().needs()} and then pip install --no-deps {' '.join(installs.apart((self.extra,)))}"
 
-    def words(self, entry: Entry, env: Any) -> dict[str, str]:
+    def task_sections(self, entry: Entry, env: Any) -> dict[str, str]:
         common = template.load("nethack_words.toml")
         seen = (
-            (f"`{name}`", common["observation"][name], template.words(spaces.to_schema(space)))
+            (f"`{name}`", common["observation"][name], template.space_text(spaces.to_schema(space)))
             for name, space in env.observation_space.spaces.items()
         )
         choices = ((f"`{k}`", _choice(each, common)) for k, each in enumerate(env.actions))

@@ -33,8 +33,8 @@ class RoboticsFamily(MujocoFamily):
         # Fetch and the Shadow Hand have been seen to repeat.
         return not str(entry.gymnasium_id).startswith(("Fetch", "Hand"))
 
-    def words(self, entry: Entry, env: gymnasium.Env[Any, Any]) -> dict[str, str]:
-        return hands.words(str(entry.gymnasium_id), env.unwrapped)
+    def task_sections(self, entry: Entry, env: gymnasium.Env[Any, Any]) -> dict[str, str]:
+        return hands.task_sections(str(entry.gymnasium_id), env.unwrapped)
 
     def render(self, env: gymnasium.Env[Any, Any]) -> Any:
         """A picture; the callback that moves the target's marker also runs the forward dynamics, so both are put back.

@@ -27,7 +27,7 @@ class StableRetroFamily(GymnasiumFamily):
     def make(self, entry: Entry, *, render: bool) -> Any:
         return _Console(str(entry.gymnasium_id))
 
-    def words(self, entry: Entry, env: Any) -> dict[str, str]:
+    def task_sections(self, entry: Entry, env: Any) -> dict[str, str]:
         rows = ((f"`{k}`", name, _BUTTONS.get(name, "none")) for k, name in enumerate(env.buttons))
         return {
             "Action": "Which buttons are pressed for one frame, 1 for each that is. Left and right together have no"

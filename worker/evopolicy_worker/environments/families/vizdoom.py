@@ -52,7 +52,7 @@ class VizdoomFamily(GymnasiumFamily):
         # A level goes on with the random numbers of the game before. Scenarios repeat.
         return _scenario(entry) == "Freedoom"
 
-    def words(self, entry: Entry, env: Any) -> dict[str, str]:
+    def task_sections(self, entry: Entry, env: Any) -> dict[str, str]:
         scenarios = template.load("vizdoom_scenarios.toml")
         texts, common = scenarios[_scenario(entry)], scenarios["common"]
         numbers = [f"`[{k}]` {common['variable'][each]}" for k, each in enumerate(env.variables)]
@@ -64,7 +64,7 @@ class VizdoomFamily(GymnasiumFamily):
                 parts[name],
                 f"an array of shape {space.shape} of float32"
                 if name == "gamevariables"
-                else template.words(spaces.to_schema(space)),
+                else template.space_text(spaces.to_schema(space)),
             )
             for name, space in env.observation_space.spaces.items()
         )

@@ -202,7 +202,7 @@ class GymnasiumFamily:
         """A picture of the current state, without changing it."""
         return env.render()
 
-    def words(self, entry: Entry, env: gymnasium.Env[Any, Any]) -> dict[str, str]:
+    def task_sections(self, entry: Entry, env: gymnasium.Env[Any, Any]) -> dict[str, str]:
         """Sections of the generated task text, by heading, in place of the documentation's; "" is what it is about."""
         return {}
 
@@ -275,7 +275,7 @@ class GymnasiumEnvironment(Environment):
         self._rewards = rewards.Scalarisation.of(entry, self.bare)
         if self._rewards is not None:
             components = self._rewards.texts(components)
-        words, spec = family.words(entry, self.bare), self.bare.spec
+        words, spec = family.task_sections(entry, self.bare), self.bare.spec
         about = About(entry, self.bare, obs_schema, action_schema, components, self._limit, words)
         made: dict[str, Any] = {"gymnasium_id": entry.gymnasium_id, "kwargs": entry.kwargs}
         made["reset_options"] = entry.reset_options
@@ -433,7 +433,7 @@ class GymnasiumEnvironment(Environment):
         observation, a reward or an info is not as the environment's spaces promise."""
         if self._promises is not None:
             self._promises.strict = True
-        trial.play(self)
+        trial.play_trial(self)
 
 
 def _wrapped(env_id: str, env: gymnasium.Env[Any, Any], wrapper: Wrapper) -> gymnasium.Env[Any, Any]:

@@ -180,7 +180,7 @@ def solved(told: Any) -> bool | None:
     return value == value and bool(value) if isinstance(value, int | float) else None
 
 
-def play(environment: Environment) -> None:
+def play_trial(environment: Environment) -> None:
     """Plays random episodes of a few steps. Raises WorkerError that names the environment, the field and the remedy."""
     earlier: dict[int, list[dict[str, bytes]]] = {}
     try:

@@ -19,7 +19,7 @@ from evopolicy_worker.environments.tasks import template
 def written(env_id: str) -> str | None:
     """The written Markdown text of an environment; None when there is none."""
     name = env_id.replace("/", "_") + ".md"
-    return template.read(name) if files(__package__).joinpath(name).is_file() else None
+    return template.read_text(name) if files(__package__).joinpath(name).is_file() else None
 
 
 def task_text(about: template.About) -> str:

@@ -25,7 +25,7 @@ _JOINTS = {
 } | {f"{short}J{k}": f"{name}: {bend}" for short, name in _FINGERS.items() for k, bend in enumerate(_BENDS)}
 
 
-def words(gymnasium_id: str, env: Any) -> dict[str, str]:
+def task_sections(gymnasium_id: str, env: Any) -> dict[str, str]:
     """The joints in the observation and the actions of a Shadow Hand or an Adroit hand; nothing for other robots."""
     if not gymnasium_id.startswith(("Hand", "Adroit")):
         return {}

@@ -33,7 +33,7 @@ _CHOICES = {
 }
 
 
-def words(env: Any) -> dict[str, str]:
+def task_sections(env: Any) -> dict[str, str]:
     """Sections of the task text of an environment of HighwayEnv."""
     sections = {"Observation": _observed(env), "Action": _acted(env)}
     if env.config.get("neighbour_vehicles_connected_lanes"):

@@ -139,7 +139,7 @@ def _of_groups(entry: Entry, own: Mapping[str, str]) -> dict[str, str]:
     ]
     texts: dict[str, list[str]] = {name: [text] for name, text in own.items()} if chosen else {}
     for group in chosen:
-        whole = _sections(read(f"{group['like']}.md")) if "like" in group else {}
+        whole = _sections(read_text(f"{group['like']}.md")) if "like" in group else {}
         without = ("End", *group.get("without", ()))
         sections = {name: text for name, text in whole.items() if name not in without}
         for name, text in (*sections.items(), ("", group.get("about", "")), *group.items()):
@@ -180,19 +180,19 @@ def _joined(texts: list[str], section: str) -> str:
 def _family_text(family: str) -> str:
     """The text written for all environments of a family; empty when there is none."""
     name = f"family_{family}.md"
-    return read(name) if files(__package__).joinpath(name).is_file() else ""
+    return read_text(name) if files(__package__).joinpath(name).is_file() else ""
 
 
 @cache
 def load(name: str) -> dict[str, Any]:
     """The tables of a TOML file of this folder."""
-    return tomllib.loads(read(name))
+    return tomllib.loads(read_text(name))
 
 
-def read(name: str) -> str:
+def read_text(name: str) -> str:
     """A file of this folder, with its includes expanded."""
     text = files(__package__).joinpath(name).read_text(encoding="utf-8")
-    return _INCLUDE.sub(lambda match: read(match[1]).rstrip("\n"), text)
+    return _INCLUDE.sub(lambda match: read_text(match[1]).rstrip("\n"), text)
 
 
 def _maze(env: gymnasium.Env[Any, Any]) -> str:
@@ -231,7 +231,7 @@ def _documentation(env: gymnasium.Env[Any, Any]) -> str:
 
 def _space(space: SpaceSchema) -> str:
     leaves = _leaves(space, "")
-    rows = [(f"`{path or 'all'}`", words(leaf)) for path, leaf in leaves[:_MAX_ROWS]]
+    rows = [(f"`{path or 'all'}`", space_text(leaf)) for path, leaf in leaves[:_MAX_ROWS]]
     if len(leaves) > _MAX_ROWS:
         rows.append(("…", f"{len(leaves) - _MAX_ROWS} more; see the space in `/info`"))
     return table(("component", "what it is"), rows)
@@ -247,7 +247,7 @@ def _leaves(space: SpaceSchema, name: str) -> list[tuple[str, SpaceSchema]]:
     return [leaf for key, part in parts.items() for leaf in _leaves(part, key)]
 
 
-def words(space: SpaceSchema) -> str:
+def space_text(space: SpaceSchema) -> str:
     """A one-line description of a space."""
     kind = space["type"]
     if kind == "Discrete":
@@ -264,12 +264,14 @@ def words(space: SpaceSchema) -> str:
     if kind == "Text":
         return f"a text of {space['min_length']} to {space['max_length']} characters"
     if kind == "Sequence":
-        return f"any number of items, each {words(space['space'])}"
+        return f"any number of items, each {space_text(space['space'])}"
     if kind == "Graph":
         edge = space["edge_space"]
-        edges = "no values on edges" if edge is None else f"each edge {words(edge)}"
-        return f"a graph as `nodes`, `edges`, `edge_links`: each node {words(space['node_space'])}; {edges}"
-    parts = list(map(words, space["spaces"].values() if kind == "Dict" else space["spaces"]))
+        edges = "no values on edges" if edge is None else f"each edge {space_text(edge)}"
+        return (
+            f"a graph as `nodes`, `edges`, `edge_links`: each node {space_text(space['node_space'])}; {edges}"
+        )
+    parts = list(map(space_text, space["spaces"].values() if kind == "Dict" else space["spaces"]))
     if kind == "OneOf":
         return "a pair of an index and a value: " + "; ".join(f"{k}: {part}" for k, part in enumerate(parts))
     return f"({', '.join(parts)})"

@@ -5,6 +5,18 @@
   new privileges, files outside (Landlock), system calls (the filter), limits.
 - When started as root, it first becomes an unprivileged user of a user namespace.
 
+| process | state | event | next |
+|---|---|---|---|
+| zygote | starting | the configuration arrives | as root: a fork in namespaces of its own goes on, and this one waits |
+| | | all is imported and frozen | serving, after `{"ready": true}` |
+| | | something fails | ended, after `{"error": ...}` |
+| | serving | a process is asked for | serving; its fork is a policy's process |
+| | | the end of a process is asked about | serving; sends how it ended |
+| | | `q`, or the worker's socket is closed | ended |
+| policy's | born | its pipes are handed out | unsealed; if that fails ended with 71, after the error |
+| | unsealed | INIT: bundle written, rights given up | sealed; if that fails ended with 71, after FAULT |
+| | sealed | the policy is imported and asked (`policy_server`) | ended, by END, by itself, or by a limit |
+
 Standard library and numpy only: the sandbox shows nothing else.
 """
 
@@ -60,8 +72,8 @@ LETTER = (ctypes.c_size_t * 7)(
 )
 """`struct msghdr` of one byte with the envelope. A `socket` asks the kernel for its kind first, which touches many
 objects."""
-player: Any = None
-"""The module `player`: imports numpy, so not before the path to it is known."""
+policy_server: Any = None
+"""The module `policy_server`: imports numpy, so not before the path to it is known."""
 scan_json = vars(json.JSONDecoder())["scan_once"]
 
 
@@ -92,7 +104,7 @@ def main() -> None:
                     protect(device)
                 module("files").take_over(config["folders"], config["libraries"], config["place"])
                 # The same for all policies, and it costs each of them a copy of the memory that it touches.
-                player.live_in(config["home"])
+                policy_server.live_in(config["home"])
             program = bytes.fromhex(config["filter"])
             # In a namespace of its own, each has the same number.
             config["filter"] = filter_of(program, 1) if config["namespaces"] else program
@@ -154,10 +166,10 @@ def module(name: str) -> Any:
 
 def warm(modules: list[str]) -> None:
     """Imports what every policy may use, so that children share it."""
-    global player
-    player = module("player")
-    player.programs = module("programs")
-    np = player.np
+    global policy_server
+    policy_server = module("policy_server")
+    policy_server.programs = module("programs")
+    np = policy_server.np
     standard = ("math", "collections", "dataclasses", "typing", "heapq", "itertools", "functools", "pathlib")
     for name in ("numpy.random", "numpy.linalg", "numpy.fft", *modules, *standard):
         importlib.import_module(name)
@@ -166,7 +178,7 @@ def warm(modules: list[str]) -> None:
     # The filter refuses `epoll`, whose watches are kernel memory that no limit counts.
     vars(selectors)["DefaultSelector"] = selectors.PollSelector
     traceback.format_exception(ValueError("warm"))
-    player.rehearse()
+    policy_server.rehearse()
 
 
 class Arenas(ctypes.Structure):
@@ -316,12 +328,12 @@ def policy_process(config: dict[str, Any], worker: int, streams: tuple[Any, Any]
         os.write(worker, f"{type(error).__name__}: {error}".encode()[:MAX_TEXT])
         os._exit(71)
     try:
-        header = bytearray(player.REQUEST_HEADER.size)
-        player.read_exactly(header)
-        length, kind, json_length = player.REQUEST_HEADER.unpack(header)
+        header = bytearray(policy_server.REQUEST_HEADER.size)
+        policy_server.read_exactly(header)
+        length, kind, json_length = policy_server.REQUEST_HEADER.unpack(header)
         body = bytearray(length)
-        player.read_exactly(body)
-        if kind != player.INIT:
+        policy_server.read_exactly(body)
+        if kind != policy_server.INIT:
             raise OSError("the first request is not INIT")
         init, _ = scan_json(str(body[:json_length], "utf-8"), 0)
         if home is not None:
@@ -329,14 +341,14 @@ def policy_process(config: dict[str, Any], worker: int, streams: tuple[Any, Any]
         else:
             for folder in ("/tmp", "/system"):
                 os.makedirs(init["home"] + folder, exist_ok=True)
-            player.live_in(init["home"])
+            policy_server.live_in(init["home"])
         write_bundle(init, memoryview(body)[json_length:])
         seal(config, init)
     except BaseException as error:
-        player.reply(player.FAULT, f"{type(error).__name__}: {error}".encode()[:MAX_TEXT])
+        policy_server.reply(policy_server.FAULT, f"{type(error).__name__}: {error}".encode()[:MAX_TEXT])
         os._exit(71)
     del body, header, config
-    player.play(init)
+    policy_server.serve_policy(init)
 
 
 def hand_out_pipes(worker: int, home: str | None) -> None:
@@ -352,7 +364,7 @@ def hand_out_pipes(worker: int, home: str | None) -> None:
     high = [os.dup2(fd, 100 + k) for k, fd in enumerate((requests, replies, stdout, stderr))]
     # Not the zygote's: the flags of an open file are the same for all who share it, and would outlive the episode.
     os.dup2(os.open("/dev/null", os.O_RDWR), 0)
-    for fd, target in zip(high, (player.REQUESTS, player.REPLIES, 1, 2), strict=True):
+    for fd, target in zip(high, (policy_server.REQUESTS, policy_server.REPLIES, 1, 2), strict=True):
         os.dup2(fd, target)
     os.closerange(5, 1024)
 

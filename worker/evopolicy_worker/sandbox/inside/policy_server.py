@@ -71,7 +71,7 @@ Reader = Callable[[Any, Any], Any]
 """From the buffer (and where the next text begins, or the payload's length) to the observation or a part of it."""
 
 
-def play(init: dict[str, Any]) -> NoReturn:
+def serve_policy(init: dict[str, Any]) -> NoReturn:
     """Builds the Policy and serves requests until the end is requested."""
     global action_bytes, home
     action_bytes, home = init["action_bytes"], init["home"]
@@ -184,12 +184,14 @@ def rehearse() -> None:
         begin, end = REQUEST_HEADER.pack(0, RESET, 0), REQUEST_HEADER.pack(0, END, 0)
         questions = iter((begin, *[act] * _REHEARSED, end))
 
-        def ask(answer: Any = action, questions: Any = questions) -> Any:
+        def act_once(answer: Any = action, questions: Any = questions) -> Any:
             os.write(pipes[0][1], next(questions))
             return answer
 
-        ask()
-        policy = types.SimpleNamespace(reset=lambda index, ask=ask: ask(), act=lambda obs, ask=ask: ask())
+        act_once()
+        policy = types.SimpleNamespace(
+            reset=lambda index, ask=act_once: ask(), act=lambda obs, ask=act_once: ask()
+        )
         answer(policy, observation_reader(space, False))
         os.read(pipes[1][0], 65536)
     REQUESTS, REPLIES = usual
