@@ -236,19 +236,18 @@ class RunOptions(PolicyPart, frozen=True, kw_only=True):
     ) -> RunSettings:
         """The settings of one run, `agent_host` as it has it. ConfigError naming the option that is wrong."""
         profile = self.profile or "own"
-        given = {name: getattr(self, name, None) for name in PUBLISHED}
+        given = {name: getattr(self, name) for name in _AS_GIVEN}
         given |= {"n_validation": self.validation, "n_heldout": self.heldout}
         given["hidden_cases"] = self.hidden_cases and self.hidden_cases.replace("-", "_")
         usual: dict[str, Any] = {"step_limit": "published"}
         if profile != "own":
             usual = PUBLISHED | dict(zip(("n_validation", "n_heldout"), HIDDEN_COUNTS[profile], strict=True))
             for name, value in given.items():
-                if value not in (None, usual[name]):
+                if name in usual and value not in (None, usual[name]):
                     raise ConfigError(
                         f"profile {profile} has {name} = {usual[name]}, but {value} was given: drop one of them"
                     )
         chosen = usual | {name: value for name, value in given.items() if value is not None}
-        chosen |= {name: getattr(self, name) for name in ("repeat", "budget", "video", "replays", "limits")}
         entry = self.entry or harnesses.entry_name(self.agent)
         settings = RunSettings(
             env=env,
@@ -313,6 +312,11 @@ class RunOptions(PolicyPart, frozen=True, kw_only=True):
         texts, exp_id = self.texts(started_in), self.exp_id or default_exp_id()
         settings = {env: self.settings(env, exp_id, agent_host, texts) for env in env_ids}
         return [self.plan(settings[env], started_in, name=env, texts=texts, **more) for env in env_ids]
+
+
+_OTHERWISE = {"entry", "model", "exp_id", "profile", "agents_md", "prompts"}
+_AS_GIVEN = [x for x in RunSettings.__struct_fields__ if x in {*RunOptions.__struct_fields__} - _OTHERWISE]
+"""Options that are settings of the run under the same name, as they are given; None: the usual value."""
 
 
 class ListenerOptions(msgspec.Struct, frozen=True, kw_only=True):

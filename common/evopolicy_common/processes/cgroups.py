@@ -167,18 +167,14 @@ def _enabled(folder: Path, wanted: set[str]) -> list[str]:
     with contextlib.suppress(OSError):
         missing = wanted & {*(folder / "cgroup.controllers").read_text().split()}
         missing -= {*control.read_text().split()}
-        if missing and not _is_root(folder):
+        # The root of the machine's hierarchy has no such file, and may hold processes beside groups.
+        if missing and (folder / "cgroup.type").exists():
             _move_away(folder)
         for controller in sorted(missing):
             with contextlib.suppress(OSError):
                 control.write_text(f"+{controller}")
         return sorted(wanted & {*control.read_text().split()})
     return []
-
-
-def _is_root(folder: Path) -> bool:
-    """Whether it is the root of the machine's hierarchy, which may hold processes beside groups."""
-    return not (folder / "cgroup.type").exists()
 
 
 def _move_away(folder: Path) -> None:

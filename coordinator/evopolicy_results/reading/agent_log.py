@@ -139,7 +139,7 @@ def _lines(path: Path) -> Iterator[bytes]:
 
 
 def _events_of(value: dict[str, Any]) -> Iterator[LogEvent]:
-    at = _stamp(value)
+    at = next((at for key in _TIMES if (at := _instant(value.get(key))) is not None), None)
     for part in parts(value):
         if part.kind == "call":
             yield _call(part.value, at)
@@ -181,10 +181,6 @@ def _strings(value: Any, depth: int = 0) -> list[str]:
         return [value]
     items = value.values() if isinstance(value, dict) else value if isinstance(value, list) else ()
     return [text for item in items for text in _strings(item, depth + 1)] if depth <= 6 else []
-
-
-def _stamp(value: dict[str, Any]) -> float | None:
-    return next((at for key in _TIMES if (at := _instant(value.get(key))) is not None), None)
 
 
 def _instant(value: Any) -> float | None:
