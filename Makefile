@@ -110,6 +110,7 @@ check: install
 	@$(BIN)/ruff check .
 	@$(BIN)/ruff format --check -q .
 	@$(BIN)/mypy
+	@$(BIN)/mypy --config-file tests/mypy.ini tests
 
 # Resumed where it was stopped (build/check-envs.jsonl). A part: make check-envs ARGS=highway
 check-envs: install

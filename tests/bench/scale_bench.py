@@ -45,7 +45,7 @@ from evopolicy_common.records.blobs import BlobStore
 from evopolicy_common.records.episodes import rendered
 from evopolicy_common.records.open_run import OpenedRun
 from evopolicy_common.wire import credentials, transport
-from evopolicy_coordinator.core.contract.records import submit_group
+from evopolicy_coordinator.core.contract.records import RunRow, submit_group
 from evopolicy_coordinator.storage.store import Reader
 from evopolicy_gateway.run_folder.layout import RunFolder, save
 from evopolicy_worker import environments
@@ -307,7 +307,7 @@ def play_really(coordinator: Coordinator, env: str, folder: Path, n: int) -> Pla
         episodes, returns = run.episodes(0)
     reader = Reader(coordinator.state / "coordinator.sqlite")
     rows = reader.outcomes(submit_group(run.id, 0, "train"), 0, 1 << 30, 1 << 40)
-    stored = reader.run(run.id)
+    stored = reader.one(RunRow, run=run.id)
     assert stored is not None
     blobs = BlobStore(coordinator.state / "blobs")
     by_seed: dict[int, bytes] = {}

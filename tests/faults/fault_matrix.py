@@ -236,8 +236,8 @@ def strike(cluster: FaultCluster, case: Case, row: Row) -> bool:
     if case.target == "cable":
         assert cluster.cable is not None
         with cluster.cable.slow() if case.fault == "slow" else cluster.cable.cut():
-            usual_s = {"cut": CUT_S, "slow": SLOW_S, "cut for minutes": PARTITION_S}
-            time.sleep(usual_s.get(case.fault, LONG_FREEZE_S))
+            lengths_s = {"cut": CUT_S, "slow": SLOW_S, "cut for minutes": PARTITION_S}
+            time.sleep(lengths_s.get(case.fault, LONG_FREEZE_S))
         return True
     if case.target == "clock":
         assert cluster.clock is not None

@@ -34,7 +34,7 @@ from evopolicy_coordinator.core.contract.effects import Effect, ReadResults, Rep
 from evopolicy_coordinator.core.contract.records import Snapshot
 from evopolicy_coordinator.core.contract.settings import CoreSettings
 from evopolicy_coordinator.core.machine import Core
-from evopolicy_coordinator.server.reason_texts import words
+from evopolicy_coordinator.server.reason_texts import reason_text
 
 ENVS = tuple(f"toy/env{index}" for index in range(16))
 EPISODES = 128
@@ -233,7 +233,7 @@ class Load:
     def status(self) -> tuple[float, int]:
         """CPU time of an operator's status, and its size as a message."""
         began = time.process_time()
-        size = len(msgspec.msgpack.encode(self.core.status(self.now, words)))
+        size = len(msgspec.msgpack.encode(self.core.status(self.now, reason_text)))
         return time.process_time() - began, size
 
 

@@ -141,7 +141,7 @@ def _state(environment: Any) -> list[Any]:
         data = simulator.data
         return [data.qpos, data.qvel, data.qacc, data.qacc_warmstart, data.xpos, data.ctrl, data.time]
     if isinstance(simulator, AcrobotEnv):
-        return [float(value) for value in simulator.state]
+        return [float(value) for value in simulator.state]  # type: ignore[attr-defined]
     return [simulator.grid.encode(), [int(place) for place in simulator.agent_pos]]
 
 

@@ -63,6 +63,6 @@ def carry(near: int, far: int, weather: int) -> None:
 
 
 if __name__ == "__main__":
-    ends = [open_device(name) for name in sys.argv[1:]]
+    near, far = map(open_device, sys.argv[1:])
     print("ready", flush=True)
-    carry(*ends, sys.stdin.fileno())
+    carry(near, far, sys.stdin.fileno())

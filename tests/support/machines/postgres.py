@@ -13,6 +13,7 @@ import tempfile
 import time
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import psycopg
 import pytest
@@ -40,7 +41,7 @@ class Server:
             pytest.skip("needs a PostgreSQL server: make test-cluster as root, or apt-get install postgresql")
         self._programs = bin_
         self.root = Path(tempfile.mkdtemp(prefix="evp-pg-"))
-        self._owner = (
+        self._owner: dict[str, Any] = (
             {} if os.geteuid() else {"user": _USER, "group": pwd.getpwnam(_USER).pw_gid, "extra_groups": []}
         )
         if not os.geteuid():

@@ -214,7 +214,7 @@ def test_an_item_over_which_its_process_ends_costs_that_item_alone() -> None:
 
 def test_who_stops_reading_waits_for_no_item() -> None:
     items: list[Any] = [partial(abs, -1)] * 8 + [partial(time.sleep, 1000.0)] * 8
-    found = Processes(2).map(operator.call, items, lambda item, why: (item, why))
+    found: Any = Processes(2).map(operator.call, items, lambda item, why: (item, why))
     assert next(found) == 1
     found.close()
 

@@ -280,7 +280,7 @@ def test_a_snapshot_of_the_documents_comes_on_request_and_repeats() -> None:
         first, _ = environment.reset(seed=seed)
         (field,) = nodes(first, "textbox")
         second = environment.step(f"fill({bid(field)!r}, 'typed')")[0]
-        assert second.keys() == environment.observation_space.spaces.keys()
+        assert second.keys() == environment.observation_space.spaces.keys()  # type: ignore[attr-defined]
         return [first["dom_object"], second["dom_object"]]
 
     first = episode(1)
@@ -299,7 +299,7 @@ def test_a_snapshot_of_the_documents_comes_on_request_and_repeats() -> None:
     assert (
         len(document["nodes"]["backendNodeId"]) == len(set(document["nodes"]["backendNodeId"])) == len(names)
     )
-    assert "dom_object" not in BrowserGymEnv("enter-text").observation_space.spaces
+    assert "dom_object" not in BrowserGymEnv("enter-text").observation_space.spaces  # type: ignore[attr-defined]
 
 
 @pytest.mark.parametrize(

@@ -132,7 +132,8 @@ def test_a_worker_holds_its_lock_until_its_end(tmp_path: Path, monkeypatch: pyte
             await cluster.start_workers(["toy/line"], slots=1)
             (lock,) = workers.iterdir()
             assert lock.read_text() == str(os.getpid())
-            processes, *_ = cluster._start_workers.args
+            starting: Any = cluster._start_workers
+            processes, *_ = starting.args
             holders = [child for child in processes._running if lock in open_files(child.pid)]
             assert [child.log.stem for child in holders] == ["test-worker"]
             assert lock not in open_files(os.getpid())

@@ -93,7 +93,7 @@ class Cluster(Operations):
     async def cancel(self, run: str) -> None:
         self.asked.append(f"cancel {run}")
 
-    async def agent_gone(self, run: str) -> None:
+    async def agent_gone(self, run: str, boot_id: str = "") -> None:
         self.asked.append(f"gone {run}")
 
 

@@ -103,7 +103,7 @@ def test_a_functions_value_is_read_as_json_and_nothing_else(run: evp.Run, tmp_pa
     assert run.value == {"gain": [1, 2.5, None]}
 
     class Bomb:
-        def __reduce__(self) -> object:
+        def __reduce__(self) -> tuple[object, ...]:
             return os.mkdir, (str(tmp_path / "unpickled"),)
 
     for content in (cloudpickle.dumps(Bomb()), b"[" * 100_000, b"\xff", b'"' + b"x" * (1 << 20) + b'"'):
