@@ -1,8 +1,8 @@
-"""The coordinator's status for the pages, requested while a page is open, and its history of a day.
+"""The coordinator's status for the pages, requested while a page is open.
 
 Rules: at most one request at a time, and after each a pause of `_SHARE` times its cost in the coordinator, so any
 number of browsers costs it a small fixed share of a core. Several views share a reply that is at most one pause old.
-Without an open page, a request for the history is sent every `_IDLE_S`.
+Without an open page, one request is sent every `_IDLE_S`.
 """
 
 from __future__ import annotations
@@ -10,10 +10,8 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import time
-from collections import OrderedDict, deque
+from collections import OrderedDict
 from collections.abc import Callable
-
-import msgspec
 
 from evopolicy_common.errors import EvopolicyError
 from evopolicy_common.logs import structlog
@@ -26,9 +24,6 @@ _LEAST_PAUSE_S = 1.0
 _IDLE_S = 30.0
 _SHARE = 60.0
 _RETRY_S = 2.0
-_SAMPLE_S = 60.0
-_SAMPLES = 24 * 60
-"""A day."""
 _RETRIES_OF_A_RUN = 100
 _RETRIED_RUNS = 1000
 STALE_S = 90.0
@@ -37,24 +32,13 @@ STALE_S = 90.0
 log: structlog.stdlib.BoundLogger = structlog.get_logger()
 
 
-class Sample(msgspec.Struct, frozen=True, kw_only=True):
-    """One minute of the history."""
-
-    at: float
-    episodes_per_s: float
-    running: int
-    queued: int
-    slots: int
-
-
 class Cluster:
-    """The latest status of a cluster, and its history. `watched` states whether a page is open."""
+    """The latest status of a cluster. `watched` states whether a page is open."""
 
     def __init__(
         self, credentials: Credentials, watched: Callable[[], bool], changed: Callable[[], None]
     ) -> None:
         self.status: StatusReply | None = None
-        self.history: deque[Sample] = deque(maxlen=_SAMPLES)
         self.trouble = ""
         """Why the coordinator does not answer; empty while it does."""
         self.operator: OperatorClient | None = None
@@ -118,17 +102,6 @@ class Cluster:
                 self.retries.move_to_end(run.run)
         while len(self.retries) > _RETRIED_RUNS:
             self.retries.popitem(last=False)
-        now = time.time()
-        if not self.history or now - self.history[-1].at >= _SAMPLE_S:
-            self.history.append(
-                Sample(
-                    at=now,
-                    episodes_per_s=status.episodes_per_s,
-                    running=sum(run.running for run in status.runs),
-                    queued=sum(run.queued for run in status.runs),
-                    slots=sum(worker.slots for worker in status.workers if worker.state == "active"),
-                )
-            )
         self._changed()
 
     def _failed(self, why: str) -> None:

@@ -1,15 +1,12 @@
-"""The cluster's page: workers, queue, history, and problems."""
+"""The cluster's page: workers, queue, and problems."""
 
 from __future__ import annotations
 
 import contextlib
 import shutil
-import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
-
-from markupsafe import Markup
 
 from evopolicy_common.cli.conventions import bytes_text
 from evopolicy_common.messages.status import DiskUse, StatusReply, WorkerStatus
@@ -18,7 +15,6 @@ from evopolicy_coordinator.web.content.cluster import Cluster
 from evopolicy_coordinator.web.content.remarks import remarks, served_by
 from evopolicy_coordinator.web.content.rendering import PAGE_ROWS, Words, ident, paged, part, short
 from evopolicy_coordinator.web.content.run_folders import RunFacts, Runs
-from evopolicy_results.figures.line_chart import Line, chart
 from evopolicy_results.html import View, notice
 from evopolicy_results.reading.environments import title_of
 
@@ -31,23 +27,17 @@ _UNKNOWN = StatusReply(
 
 
 def cluster_view(cluster: Cluster, words: Words, runs: Runs, roots: Sequence[Path]) -> View:
-    """Workers, queue, history, and problems."""
+    """Workers, queue, and problems."""
     status = cluster.status or _UNKNOWN
     view = View("worker-rows", "open-rows")
-    caption = "Episodes per second, and jobs that run and wait; a point a minute."
-    empty = "The history begins now: a point a minute."
     classes = {worker.fingerprint: worker.versions for worker in status.workers}
     by_run = {run.run: run for run in runs.by_key.values() if run.run}
     names = {run.run: f"{run.entry} on {title_of(run.env)}" for run in status.runs}
     workers = sorted(status.workers, key=lambda one: (one.state == "active", one.worker))
     shown, pages = paged(workers, words, _row_texts)
-    svg = Markup(_history(cluster))
     view.parts |= {
         "facts": part("facts", facts=_cluster_facts(status) if cluster.status else []),
         "notices": part("notices", notices=_cluster_notices(cluster, status)),
-        "history": part(
-            "figure", ident="history", svg=svg, title="The last day", caption=caption, empty=empty
-        ),
         "queue": part("queue", rows=status.queue[:PAGE_ROWS], left_out=len(status.queue[PAGE_ROWS:])),
         "disks": part("disks", disks=_disks(status.disk, roots)),
         "classes": part("classes", classes=sorted(classes.items())),
@@ -125,20 +115,3 @@ def _plays(
         (names.get(run, run), by_run[run].key if run in by_run else "", n)
         for run, n in sorted(worker.playing.items(), key=lambda one: -one[1])[:4]
     ]
-
-
-def _history(cluster: Cluster) -> str:
-    if len(cluster.history) < 2:
-        return ""
-    now = time.time()
-    hours = [(sample.at - now) / 3600 for sample in cluster.history]
-
-    def line(name: str, field: str) -> Line:
-        values = [float(getattr(one, field)) for one in cluster.history]
-        return Line(name, list(zip(hours, values, strict=True)))
-
-    rate = line("episodes a second", "episodes_per_s")
-    jobs = [line(name, name) for name in ("running", "queued", "slots")]
-    return chart("Episodes a second over the last day", "hours", [rate]) + chart(
-        "Jobs over the last day", "hours", jobs
-    )
