@@ -24,7 +24,6 @@ from evopolicy_common.processes.notices import Waiting
 from evopolicy_common.processes.preflight import check_writable
 from evopolicy_common.records.aggregates import mean, std
 from evopolicy_common.records.episodes import rendered
-from evopolicy_common.records.newest import described
 from evopolicy_common.records.policies import bundles
 from evopolicy_common.records.policies.checkpoints import bundle_of
 from evopolicy_common.terminal import one_line, say, say_json
@@ -181,8 +180,6 @@ def policy_bundle(policy: Path) -> bundles.Bundle:
     """Bundles the policy in a folder, or in `system/` below it. Raises ConfigError when it is missing or invalid."""
     folder = policy if (policy / "policy.py").is_file() else policy / "system"
     if not (folder / "policy.py").is_file():
-        if text := described(policy):
-            raise ConfigError(f"{policy} is {text}")
         problem = f"{policy} is a file" if policy.exists() else f"there is no folder {policy}"
         if policy.is_dir():
             problem = f"{policy} holds no policy.py"

@@ -23,7 +23,6 @@ from evopolicy_common.messages.operator import Committed, RunEnd
 from evopolicy_common.messages.run_settings import AllConditions, HiddenIsolation, Line, Start, metering_of
 from evopolicy_common.records.code_metrics import PUBLISHED_SCHEMA
 from evopolicy_common.records.model_record import Level
-from evopolicy_common.records.newest import described_data
 
 RECORD_VERSION = 5
 """Version of our own fields. Incremented only when older readers would misunderstand a file, not for added fields."""
@@ -437,8 +436,6 @@ def encode_run_record(record: RunRecord) -> bytes:
 
 def decode_run_record(data: bytes) -> RunRecord:
     """The record in `data`. Raises ProtocolError when this version cannot read it, such as the published software's."""
-    if newest := described_data(data):
-        raise ProtocolError(f"this is {newest}")
     try:
         header = _headers.decode(data)
         if header.schema_version == PUBLISHED_SCHEMA and header.record_version == RECORD_VERSION:
@@ -451,7 +448,7 @@ def decode_run_record(data: bytes) -> RunRecord:
         )
     raise ProtocolError(
         f"run.json has schema_version {header.schema_version} and record_version {header.record_version}; this version"
-        f" reads {PUBLISHED_SCHEMA} and {RECORD_VERSION}: use the version of evopolicy that wrote it"
+        f" reads {PUBLISHED_SCHEMA} and {RECORD_VERSION}: use the software that wrote it"
     )
 
 

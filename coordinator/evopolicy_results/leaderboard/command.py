@@ -17,7 +17,6 @@ from evopolicy_common.cli.frame import App
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.processes.preflight import check_writable
 from evopolicy_common.processes.scratch import scratch_folder
-from evopolicy_common.records.newest import described
 from evopolicy_common.terminal import one_line, say
 from evopolicy_results.publish.archive import Archive
 from evopolicy_results.publish.findings import Checked
@@ -69,8 +68,6 @@ def leaderboard(
             )
         labs[key.lower()] = name
     for path in files:
-        if text := described(path):
-            fail(f"{path} is {text}")
         if not path.is_file():
             fail(f"{path}: there is no such file")
     # Here, not above: they need jinja2, and `evopolicy` loads this module to list its commands.

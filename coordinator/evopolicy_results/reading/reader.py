@@ -22,7 +22,6 @@ from evopolicy_common.errors import BundleError, ConfigError, ProtocolError
 from evopolicy_common.messages.bounds import check_plausible
 from evopolicy_common.messages.environment import Split
 from evopolicy_common.records.aggregates import mean, std
-from evopolicy_common.records.newest import described
 from evopolicy_common.records.policies.checkpoints import CheckpointMeta, bundle_of
 from evopolicy_common.records.policies.submits import read_submits
 from evopolicy_common.records.rescores import Rescored, RescoreRecord, read_rescore
@@ -62,9 +61,7 @@ def find_run_dirs(paths: Iterable[Path]) -> tuple[list[Path], list[LeftOut]]:
     folders, without = run_folders(paths)
     left_out = []
     for path in without:
-        if text := described(path):
-            reason = f"this is {text}"
-        elif path.is_dir():
+        if path.is_dir():
             reason = "no run directory here"
         else:
             reason = "a file, not a run directory" if path.exists() else "no such folder"

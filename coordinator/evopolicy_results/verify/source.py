@@ -13,7 +13,6 @@ import msgspec
 
 from evopolicy_common.errors import ConfigError, ProtocolError
 from evopolicy_common.messages.environment import Split
-from evopolicy_common.records.newest import described
 from evopolicy_common.records.policies.submits import SubmitFiles, read_submits
 from evopolicy_common.records.run_files import RUN_JSON, read_record
 from evopolicy_common.records.run_record import RunRecord
@@ -60,8 +59,6 @@ def read_run(root: Path) -> RunUnderTest:
     try:
         record = read_record(root)
     except OSError as error:
-        if text := described(root):
-            raise ConfigError(f"{root} is {text}") from error
         raise ConfigError(
             f"{root} is not the directory of a finished run: {RUN_JSON}: {error.strerror}; name a folder such as"
             " runs/evolve/gym_acrobot/first"

@@ -146,7 +146,7 @@ SIGNED_ANEW: dict[str, tuple[Edit, str, str]] = {
     "a length beyond all numbers": (lambda f: f.text(EPISODES, b'"length":', b'"length":' + b"9" * 400 + b',"x":'), "format", "damaged"),
     "text that is no UTF-8": (lambda f: f.text(RUN, b'"model": "', b'"model": "\xff\xfe'), "format", "is damaged"),
     "a document nested without end": (lambda f: f.files.__setitem__(OPENING, b"[" * 100_000), "format", "damaged"),
-    "a record of a later version": (lambda f: f.json(RUN, put("record_version", value=99)), "format", "use the version"),
+    "a record of a later version": (lambda f: f.json(RUN, put("record_version", value=99)), "format", "use the software"),
     "a document of another kind": (lambda f: f.files.__setitem__(RESULT, b"[]"), "format", "damaged"),
 }  # fmt: skip
 """Of forgers who sign anew."""

@@ -111,7 +111,7 @@ def test_file_of_a_newer_version_is_refused_by_name() -> None:
         {"record_version": RECORD_VERSION - 1},
         {"record_version": RECORD_VERSION + 1},
     ):
-        with pytest.raises(ProtocolError, match=r"run\.json has schema_version .*use the version"):
+        with pytest.raises(ProtocolError, match=r"run\.json has schema_version .*use the software"):
             decode_run_record(json.dumps(document | newer).encode())
     with pytest.raises(ProtocolError, match="schema_version 2"):
         decode_summary(json.dumps(json.loads(msgspec.json.encode(NOT_OK)) | {"schema_version": 2}).encode())
