@@ -132,14 +132,6 @@ def serve(
             " limit.",
         ),
     ] = CoreSettings().agent_wait_s,
-    metrics: Annotated[
-        str | None,
-        typer.Option(
-            metavar="HOST:PORT",
-            help="Serve Prometheus' /metrics, and /healthz, without a token. They contain nothing"
-            " about single runs.",
-        ),
-    ] = None,
     ready_file: Annotated[
         Path | None,
         typer.Option(
@@ -197,7 +189,6 @@ def serve(
             hidden_wait_s=hidden_wait,
             agent_wait_s=agent_wait,
         ),
-        metrics=metrics,
     )
     with announcing(ready_file) as announce:
         asyncio.run(_run(options, announce))

@@ -17,7 +17,6 @@ import asyncio
 import time
 from collections.abc import Callable
 from math import inf
-from typing import TYPE_CHECKING
 
 from evopolicy_common.errors import DamagedStoreError, LeadLostError, PartFailedError, StorageError
 from evopolicy_common.logs import structlog
@@ -29,9 +28,6 @@ from evopolicy_coordinator.core.machine import Core
 from evopolicy_coordinator.storage.sealing import SharedFiles
 from evopolicy_coordinator.storage.store import Store
 from evopolicy_coordinator.storage.writer import Outbox, Writer
-
-if TYPE_CHECKING:
-    from evopolicy_coordinator.server.monitoring.metrics import Meter
 
 log: structlog.stdlib.BoundLogger = structlog.get_logger()
 
@@ -76,8 +72,6 @@ class CoreHost:
         self.storage_error = ""
         """Why the store cannot be written; empty while it can."""
         self.stopping = False
-        self.meter: Meter | None = None
-        """If set, observes the effects of every step."""
         self._timer: asyncio.TimerHandle | None = None
         self._timer_at = 0.0
         self._reloading: asyncio.Task[None] | None = None
@@ -252,8 +246,6 @@ class CoreHost:
             # A bug. The core's state in memory may be half changed; the state on disk is not.
             self._core_failed(error)
             return
-        if self.meter is not None:
-            self.meter.observe(effects)
         outbox.put(effects)
 
     def _set_timer(self) -> None:
@@ -291,8 +283,6 @@ class CoreHost:
         # The clock may have been set back while no coordinator ran. Nothing may end before it started.
         self._unix_offset += max(0.0, latest_time(snapshot) - self.now())
         self.core, effects = Core.load(self._settings, snapshot, self.now())
-        if self.meter is not None:
-            self.meter.loaded(self.core)
         self._outbox = Outbox(self._writer, self._carry_out, self._on_write_failure)
         self._outbox.put(effects)
         self.storage_error, self.last_core = "", None

@@ -86,8 +86,6 @@ class Options(msgspec.Struct, frozen=True, kw_only=True):
     local: dict[str, str] | None = None
     """For a local cluster's coordinator: see `state_folder.Holder`."""
     core: CoreSettings = CoreSettings()
-    metrics: str | None = None
-    """HOST:PORT of `/metrics` and `/healthz`; None: not served."""
 
 
 async def run(options: Options, stop: asyncio.Event, on_ready: Callable[[Ready], None]) -> None:
@@ -209,14 +207,6 @@ async def _lead(
         parser = RequestParser(state.identity, blobs, uploads, runs, machines, definitions)
         cluster = state.identity.cluster
         service = Service(cluster, store, reader, parser, options.core)
-        if options.metrics is not None:
-            # Imported here so that a start without the option does not wait for this module.
-            from evopolicy_coordinator.server.monitoring.metrics import Meter, metrics_server
-
-            meter = service.host.meter = Meter(state.root, service.status)
-            serving = metrics_server(options.metrics, meter, lambda: service.serves)
-            port = await opened.enter_async_context(serving)
-            log.info("metrics are served", address=options.metrics, port=port)
         opened.push_async_callback(service.stop)
         await service.start()
         if isinstance(place, str):

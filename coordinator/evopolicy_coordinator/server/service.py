@@ -50,12 +50,12 @@ from evopolicy_coordinator.core.tables.model import Worker
 from evopolicy_coordinator.server.claims import Claims
 from evopolicy_coordinator.server.core_host import CoreHost
 from evopolicy_coordinator.server.definitions import failed, undescribed
-from evopolicy_coordinator.server.monitoring.watchdog import LoopWatchdog
 from evopolicy_coordinator.server.reader import ServiceReader, answer_bytes, answer_to, damaged, lane_of
 from evopolicy_coordinator.server.reason_texts import message, operator_words, reason_text
 from evopolicy_coordinator.server.refused_workers import RefusedWorkers
 from evopolicy_coordinator.server.request_checks import finite_wait
 from evopolicy_coordinator.server.request_parser import Parsed, RequestParser
+from evopolicy_coordinator.server.watchdog import LoopWatchdog
 from evopolicy_coordinator.storage.disk_use import sizes
 from evopolicy_coordinator.storage.store import Store
 from evopolicy_coordinator.storage.writer import Writer
@@ -162,7 +162,7 @@ class Service:
         """Handles the appearance or loss of a worker's liveliness token."""
         worker = key.rsplit("/", 2)[-2]
         log.debug("liveliness", worker=worker, alive=alive)
-        if not alive and self.serves:
+        if not alive and self.host.core is not None and not self.host.stopping:
             self.host.handle(LivenessLost(stimulus_id=self._stimulus("liveness"), worker=worker))
             self.host.flush()
 
@@ -350,15 +350,6 @@ class Service:
                 )
         run = parsed.asker if parsed.subtree == "gw" else None
         self._reader.get(run, message, answer_to(query, parsed.asker))
-
-    @property
-    def serves(self) -> bool:
-        """Whether a core is loaded."""
-        return self.host.core is not None and not self.host.stopping
-
-    def status(self) -> StatusReply | None:
-        """The current status for operators; None while no core is loaded."""
-        return None if self.host.core is None else self._status(self.host.core)
 
     def _status_bytes(self, core: Core, max_age_s: float) -> bytes:
         """The status as a message; the last one again if it is young enough, as each visits all state."""

@@ -30,11 +30,11 @@ from evopolicy_common.logs import structlog
 from evopolicy_common.messages.status import StatusReply
 from evopolicy_common.wire.credentials import Credentials
 from evopolicy_common.wire.http import bound, serving
-from evopolicy_coordinator.server.monitoring.metrics import CONTENT_TYPE, StatusCollector
 from evopolicy_coordinator.web.access import Access, Guard
 from evopolicy_coordinator.web.content import rendering
 from evopolicy_coordinator.web.content.cluster import Cluster, set_within
 from evopolicy_coordinator.web.content.feeds import Feeds
+from evopolicy_coordinator.web.content.metrics import CONTENT_TYPE, StatusCollector
 from evopolicy_coordinator.web.content.rendering import Words
 from evopolicy_coordinator.web.content.run_detail import IMAGES, Detail
 from evopolicy_coordinator.web.content.run_folders import Reader, RunFacts, Runs
@@ -295,7 +295,7 @@ class Site:
         return PlainTextResponse("ok\n")
 
     async def metrics(self, request: Request) -> Response:
-        """The coordinator's last metrics, and those of this process, in Prometheus' text format."""
+        """The cluster's last status, and figures of this process, in Prometheus' text format."""
         if self.cluster is not None:
             self.cluster.wake()
         return Response(await asyncio.to_thread(generate_latest, self._registry), media_type=CONTENT_TYPE)

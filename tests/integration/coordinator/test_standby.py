@@ -43,8 +43,8 @@ from evopolicy_common.wire.credentials import Credentials, Role
 from evopolicy_common.wire.transport import connect
 from evopolicy_coordinator.cli.status import render
 from evopolicy_coordinator.pki import machines
-from evopolicy_coordinator.server.monitoring.metrics import StatusCollector
 from evopolicy_coordinator.storage.engines import connect as connect_to_database
+from evopolicy_coordinator.web.content.metrics import StatusCollector
 
 pytestmark = pytest.mark.cluster
 

@@ -89,9 +89,9 @@ def rows(cell: str) -> str:
 
 @pytest.mark.timeout(600)
 def test_a_sweep_is_watched_from_start_to_end(tmp_path: Path) -> None:
-    metrics, web = (f"127.0.0.1:{free_port()}" for _ in range(2))
+    web = f"127.0.0.1:{free_port()}"
     code = 'print("<i>I saw</i> the first return", flush=True)\nwait_for("go")\nsubmit("1-2")\n'
-    sweep = Sweep(tmp_path, code, 3, "--metrics", metrics)
+    sweep = Sweep(tmp_path, code, 3)
     works, shows = (*sweep.works, "--slots", "2"), (*sweep.shows, "--http", web)
     hidden = f"{rows('tr')}.some((row) => row.innerText.includes('hidden'))"
     fact = "document.querySelector('#facts b')?.textContent.startsWith"
@@ -174,16 +174,5 @@ def test_a_sweep_is_watched_from_start_to_end(tmp_path: Path) -> None:
                             assert page.violations() == []
                             assert page.run("document.documentElement.scrollWidth <= innerWidth")
                         assert page.problems == []
-            output = answer(f"http://{metrics}/metrics")
-            for line in (
-                'evopolicy_submits_total{verdict="ok"}',
-                'evopolicy_episodes_total{split="heldout",verdict="ok"} 2.0',
-                "evopolicy_submit_duration_seconds_bucket",
-                "process_cpu_seconds_total",
-                "evopolicy_up 1.0",
-                "evopolicy_store_database_bytes",
-            ):
-                assert line in output, output
-            assert answer(f"http://{metrics}/healthz") == "ok\n"
     finally:
         sweep.coordinator.stop()

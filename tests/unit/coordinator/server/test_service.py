@@ -135,8 +135,7 @@ async def test_an_open_run_without_a_gateway_for_an_hour_is_abandoned(tmp_path: 
         now = world.service.host.now
         world.service.host.now = lambda: now() + 3601.0  # type: ignore[method-assign]
         await world.answer(world.state(other))
-        status = world.service.status()
-        assert status is not None
+        status = await world.status()
         assert {run.run: run.abandoned for run in status.runs} == {created.run: True, other.run: False}
         (line,) = abandoned(status.runs)
         assert line.endswith(f"end it with evopolicy runs cancel {created.run}")

@@ -9,7 +9,7 @@ import pytest
 import structlog
 from structlog.testing import capture_logs
 
-from evopolicy_coordinator.server.monitoring import watchdog
+from evopolicy_coordinator.server import watchdog
 
 
 def test_gap_is_reported_and_its_place_named(monkeypatch: pytest.MonkeyPatch) -> None:
