@@ -12,7 +12,7 @@ from functools import cache
 from pathlib import Path
 
 COMMANDS = (
-    "accept-worlds|backup|certs|check|check-env|countersign|data|demo|diff|disk|doctor|envs|epoch|export|files"
+    "accept-worlds|backup|certs|check|check-env|data|demo|diff|disk|doctor|envs|epoch|export|files"
     "|finish|gc|harbor|identity|leaderboard|local|move|publish|replay|report|rescore|router-config|run|runs"
     "|setup|status|suite|try|verify|web|workers"
 )

@@ -3,28 +3,21 @@
 from __future__ import annotations
 
 import contextlib
-import re
-import time
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Annotated
 
-import typer
-
-from evopolicy_common.cli.conventions import Json, State, fail
+from evopolicy_common.cli.conventions import Json, State
 from evopolicy_common.cli.frame import App
 from evopolicy_common.console import table, terminal
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.records import journal
-from evopolicy_common.records.blobs import write_atomically
 from evopolicy_common.terminal import say, say_json
 from evopolicy_common.wire.credentials import default_state_dir, no_state
 from evopolicy_coordinator import splits
-from evopolicy_coordinator.pki.identity import public_key, sign
+from evopolicy_coordinator.pki.identity import public_key
 from evopolicy_coordinator.storage.engines import place_of
 from evopolicy_coordinator.storage.state_folder import StateFolder
 from evopolicy_coordinator.storage.store import Reader
-from evopolicy_results.publish.contents import SIGNED_HEAD, Countersignature, document, head_digest
 
 _PAGE_BYTES = 1 << 20
 
@@ -78,42 +71,9 @@ def identity(state: State = None) -> None:
     Publish the key in a place that is known to be yours, so that others can pass it to `evopolicy check --identity`.
     """
     root = state or default_state_dir()
-    _check_folder(root)
-    say(public_key(root))
-
-
-def countersign(
-    head: Annotated[
-        str,
-        typer.Argument(
-            metavar="SIGNED_HEAD",
-            help="Head of another coordinator's journal: 64 hexadecimal digits.",
-            show_default=False,
-        ),
-    ],
-    out: Annotated[Path, typer.Option(help="File to write, for `evopolicy check --head`.")],
-    state: State = None,
-) -> None:
-    """Sign the head of another coordinator's journal, as evidence that it existed at this time.
-
-    The signature says nothing about the journal's content. Keep a copy of the file.
-    """
-    root = state or default_state_dir()
-    if not re.fullmatch(r"[0-9a-fA-F]{64}", head):
-        fail(f"{head!r} is no head: 64 hexadecimal digits, as `evopolicy-coordinator epoch list` prints them")
-    _check_folder(root)
-    if out.exists():
-        raise ConfigError(f"--out {out} is there already; name a new file")
-    at = round(time.time(), 3)
-    key, signature = sign(root, head_digest(head.lower(), at), SIGNED_HEAD)
-    signed = Countersignature(head=head.lower(), at=at, key=key, signature=signature)
-    write_atomically(out, document(signed))
-    say(f"{out}: signed by {key}")
-
-
-def _check_folder(root: Path) -> None:
     if not root.is_dir():
         raise ConfigError(f"--state {root}: no such state folder")
+    say(public_key(root))
 
 
 def _current(root: Path) -> str:

@@ -34,9 +34,6 @@ app.add_typer(certs_cli.app, name="certs")
 app.add_typer(epochs_cli.app, name="epoch")
 app.command(epilog="Example: evopolicy-coordinator identity --state /var/lib/evopolicy")(epochs_cli.identity)
 app.command(
-    epilog="Example: evopolicy-coordinator countersign HEAD --out head.json --state /var/lib/evopolicy"
-)(epochs_cli.countersign)
-app.command(
     "accept-worlds", epilog="Example: evopolicy-coordinator accept-worlds --state /var/lib/evopolicy"
 )(worlds_cli.accept_worlds)
 app.command(

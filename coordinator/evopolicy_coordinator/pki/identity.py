@@ -31,8 +31,8 @@ def of_run(state: Path, what: str, key: str) -> bytes:
     return hmac.digest(load_or_create_secret(state / SIGNING_KEY), message, "sha256")
 
 
-def sign(state: Path, digest: str, kind: bytes = SIGNED_MANIFEST) -> tuple[str, str]:
+def sign(state: Path, digest: str) -> tuple[str, str]:
     """Signs a SHA-256 (hex). Returns the public key (64 hex digits) and the signature (128)."""
     key = Ed25519PrivateKey.from_private_bytes(load_or_create_secret(state / SIGNING_KEY))
     public = key.public_key().public_bytes(Encoding.Raw, PublicFormat.Raw).hex()
-    return public, key.sign(kind + bytes.fromhex(digest)).hex()
+    return public, key.sign(SIGNED_MANIFEST + bytes.fromhex(digest)).hex()

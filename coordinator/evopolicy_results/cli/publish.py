@@ -21,15 +21,14 @@ from evopolicy_common.cli.conventions import (
 )
 from evopolicy_common.cli.frame import App
 from evopolicy_common.console import listing, terminal
-from evopolicy_common.errors import DECODE_ERRORS, ConfigError, ProtocolError
-from evopolicy_common.regular_files import read_given
+from evopolicy_common.errors import ConfigError, ProtocolError
 from evopolicy_common.terminal import counted, one_line, say, say_json
 from evopolicy_results.cli.cluster import Local, Runs, State, Where, first
 from evopolicy_results.publish import replay as replays
 from evopolicy_results.publish import rules
 from evopolicy_results.publish.archive import Archive
 from evopolicy_results.publish.collect import Published, Publisher, find_runs, needles_of_this_machine
-from evopolicy_results.publish.contents import Countersignature, Listed
+from evopolicy_results.publish.contents import Listed
 from evopolicy_results.publish.findings import KINDS, Checked
 
 FAILED, NOT_REPLAYED = 1, 3
@@ -132,8 +131,7 @@ def check(
         list[str] | None,
         typer.Option(
             metavar="HEAD",
-            help="Earlier head of the journal: 64 hexadecimal digits, or a file of"
-            " `evopolicy-coordinator countersign`; may be repeated.",
+            help="Earlier head of the journal, 64 hexadecimal digits; may be repeated.",
         ),
     ] = None,
     as_json: Json = False,
@@ -147,12 +145,14 @@ def check(
         fail(
             f"--identity {identity!r}: 64 hexadecimal digits, as `evopolicy-coordinator identity` prints them"
         )
+    for each in head or ():
+        if not re.fullmatch(r"[0-9a-fA-F]{64}", each):
+            fail(f"--head {each!r}: 64 hexadecimal digits, as `evopolicy-coordinator epoch list` prints them")
     with fail_on_our_errors():
         share = replays.share_of("--replay", replay)
-        noted = [_noted(each) for each in head or ()]
         try:
             with Archive(file) as archive:
-                checked = rules.check(archive, identity or "", noted)
+                checked = rules.check(archive, identity or "", [each.lower() for each in head or ()])
                 if share is None:
                     checked.add("replay", "open", "not asked for; --replay 5% plays recorded actions again")
                 elif checked.failed:
@@ -174,16 +174,6 @@ def check(
         or any(map(checked.unrecorded, checked.recorded))
     )
     raise typer.Exit(FAILED if checked.failed else 0 if replayed else NOT_REPLAYED)
-
-
-def _noted(text: str) -> str | Countersignature:
-    """A noted head. Ends the command for anything else."""
-    if re.fullmatch(r"[0-9a-fA-F]{64}", text):
-        return text.lower()
-    try:
-        return msgspec.json.decode(read_given(Path(text), "a file of that name", 4096), type=Countersignature)
-    except (ConfigError, *DECODE_ERRORS) as error:
-        fail(f"--head {text!r} is neither 64 hexadecimal digits nor a countersignature's file: {error}")
 
 
 async def _replay(archive: Archive, checked: Checked, share: float) -> None:

@@ -58,11 +58,6 @@ digest = journal.digest
 """SHA-256 (hex) of bytes."""
 
 
-def head_digest(head: str, at: float) -> str:
-    """The signed bytes of a countersignature."""
-    return digest(f"{head} {at!r}".encode())
-
-
 class Manifest(msgspec.Struct, frozen=True, kw_only=True):
     """The root of the tree of digests."""
 
@@ -81,17 +76,6 @@ class Signature(msgspec.Struct, frozen=True, kw_only=True):
 
     key: Word
     signature: Word
-
-
-class Countersignature(msgspec.Struct, frozen=True, kw_only=True):
-    """Another coordinator's word that it saw a journal's head, in a file of its own beside the results."""
-
-    head: Word
-    at: Number
-    """By its clock, Unix seconds."""
-    key: Word
-    signature: Word
-    """Of `head_digest`."""
 
 
 class Episode(msgspec.Struct, frozen=True, kw_only=True):
@@ -237,15 +221,15 @@ def completeness(listed: Sequence[Listed]) -> str:
     )
 
 
-SIGNED_MANIFEST, SIGNED_HEAD = b"evopolicy manifest 1\0", b"evopolicy head 1\0"
-"""Prefixes of the signed bytes: a signature of one kind is not valid for the other."""
+SIGNED_MANIFEST = b"evopolicy manifest 1\0"
+"""Prefix of the signed bytes."""
 
 
-def signed_by(key: str, signature: str, digest: str, kind: bytes = SIGNED_MANIFEST) -> bool:
+def signed_by(key: str, signature: str, digest: str) -> bool:
     """Whether the owner of the public `key` signed the `digest`; False for anything malformed."""
     try:
         public = Ed25519PublicKey.from_public_bytes(bytes.fromhex(key))
-        public.verify(bytes.fromhex(signature), kind + bytes.fromhex(digest))
+        public.verify(bytes.fromhex(signature), SIGNED_MANIFEST + bytes.fromhex(digest))
     except (InvalidSignature, ValueError):
         return False
     return True

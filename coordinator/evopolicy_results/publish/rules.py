@@ -16,14 +16,11 @@ from typing import TypeVar
 from evopolicy_common.errors import ProtocolError
 from evopolicy_common.records import journal
 from evopolicy_common.records.journal import Ended, Opened
-from evopolicy_common.records.summary import utc_text
 from evopolicy_common.records.words import CANARY
 from evopolicy_common.terminal import counted
 from evopolicy_results.publish import card as cards
 from evopolicy_results.publish import contents, descriptions, fields
 from evopolicy_results.publish.contents import (
-    SIGNED_HEAD,
-    Countersignature,
     Manifest,
     Removed,
     Signature,
@@ -35,11 +32,10 @@ from evopolicy_results.publish.run_rules import check_run, check_starts, read_ru
 T = TypeVar("T")
 
 
-def check(files: Files, identity: str = "", heads: Sequence[str | Countersignature] = ()) -> Checked:
+def check(files: Files, identity: str = "", heads: Sequence[str] = ()) -> Checked:
     """All but the replay. `identity`: the public key (hex) that the signer must have; empty: any.
 
-    `heads`: of the journal, as they were noted elsewhere: hexadecimal digits, or another coordinator's
-    countersignature.
+    `heads`: of the journal, as they were noted elsewhere, hexadecimal digits.
     """
     checked = Checked()
     manifest = _manifest(files, identity, checked)
@@ -48,7 +44,7 @@ def check(files: Files, identity: str = "", heads: Sequence[str | Countersignatu
     _names(files, manifest, checked)
     damaged, digests = _digests(files, manifest, checked)
     entries = _journal(files, manifest, checked)
-    for state, text in _order(entries, heads, checked.signer):
+    for state, text in _order(entries, heads):
         checked.add("order", state, text)
     try:
         checked.removed = _document(files, contents.REMOVED, tuple[Removed, ...], checked)
@@ -183,30 +179,19 @@ def _journal(files: Files, manifest: Manifest, checked: Checked) -> History:
     return History(entries, heads)
 
 
-def _order(
-    history: History, noted: Sequence[str | Countersignature], signer: str
-) -> Iterator[tuple[State, str]]:
+def _order(history: History, noted: Sequence[str]) -> Iterator[tuple[State, str]]:
     """Whether the journal had the heads that were noted elsewhere."""
     if not noted:
         text = "the journal is its owner's, who could have deleted it and begun another"
         yield "open", f"{text}: compare its head with one that was noted elsewhere in time (--head)"
-    for each in noted:
-        head, by = each, "that you gave"
-        if isinstance(each, Countersignature):
-            head, by = each.head, f"countersigned by {each.key} at {utc_text(each.at)} by its clock"
-            if not signed_by(each.key, each.signature, contents.head_digest(each.head, each.at), SIGNED_HEAD):
-                yield "failed", f"not a countersignature by {each.key}"
-                continue
-            if each.key == signer:
-                yield "open", "countersigned with the signer's own key, which shows nothing more"
-                continue
+    for head in noted:
         if head not in history.heads:
-            yield "failed", f"the journal never had the head {head}, {by}: it was changed, or begun anew"
+            yield "failed", f"the journal never had the head {head}: it was changed, or begun anew"
             continue
-        number = history.heads.index(str(head))
+        number = history.heads.index(head)
         later = sum(isinstance(entry, Opened) for entry in history.entries[number + 1 :])
         opened = counted(later, "run")
-        yield "ok", f"the journal had entry {number} with the head {by}; {opened} opened after it"
+        yield "ok", f"the journal had entry {number} with the head that you gave; {opened} opened after it"
 
 
 def _history_fault(entries: Sequence[journal.EpochEntry]) -> str | None:
