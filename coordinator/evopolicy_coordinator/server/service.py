@@ -55,7 +55,6 @@ from evopolicy_coordinator.server.reason_texts import message, operator_words, r
 from evopolicy_coordinator.server.refused_workers import RefusedWorkers
 from evopolicy_coordinator.server.request_checks import finite_wait
 from evopolicy_coordinator.server.request_parser import Parsed, RequestParser
-from evopolicy_coordinator.server.watchdog import LoopWatchdog
 from evopolicy_coordinator.storage.disk_use import sizes
 from evopolicy_coordinator.storage.store import Store
 from evopolicy_coordinator.storage.writer import Writer
@@ -111,7 +110,6 @@ class Service:
         self.host = CoreHost(settings, self._writer, self._carry_out, self._let_go)
         self._tasks: set[asyncio.Task[None]] = set()
         self._started_at = self.host.now()
-        self._watchdog: LoopWatchdog | None = None
         self._sweeper: asyncio.TimerHandle | None = None
         self._n_events = 0
         self._last_status: tuple[float, bytes] | None = None
@@ -124,7 +122,6 @@ class Service:
     async def start(self) -> None:
         """Loads the core from the store. Raises StorageError and PartFailedError, as `CoreHost.start`."""
         await self.host.start()
-        self._watchdog = LoopWatchdog()
         self._sweep()
 
     async def stop(self) -> None:
@@ -144,8 +141,6 @@ class Service:
         self._let_go()
         await self._writer.close()
         await asyncio.to_thread(self._reader.close)
-        if self._watchdog is not None:
-            self._watchdog.close()
 
     # Queries in.
 
