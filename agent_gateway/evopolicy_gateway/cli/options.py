@@ -44,15 +44,6 @@ Local = Annotated[
     ),
 ]
 Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON; progress goes to stderr.")]
-Web = Annotated[
-    bool,
-    typer.Option(
-        "--web",
-        help="Show the runs live in a browser; see `evopolicy web`.",
-        rich_help_panel=RUN,
-    ),
-]
-
 _LOCAL_ONLY = {
     "hidden_isolation": "--hidden-isolation applies only to a cluster started by this command; otherwise set it at the"
     " coordinator: evopolicy-coordinator --hidden-isolation",

@@ -50,7 +50,6 @@ def run(
     given: RunOptions,
     jail: JailSettings,
     served: ListenerOptions,
-    web: options.Web = False,
     as_json: options.Json = False,
 ) -> None:
     """Play one run on a cluster.
@@ -61,7 +60,7 @@ def run(
     held = jail.of_remote_agent() if given.agent == listener.AGENT else jail
     agent_host = listener.agent_host_of(given.agent, served.agent_host)
     plans = _plans(given, [one_environment(env)], agent_host, jail=held, listener=served.listener())
-    _play(plans, where, 1, as_json, web=web)
+    _play(plans, where, 1, as_json)
 
 
 @app.command(epilog="Example: evopolicy local --env core16 --agent evolve --budget 8 --parallel 2")
@@ -75,7 +74,6 @@ def local(
         int, typer.Option(min=1, max=64, help="Runs at once.", rich_help_panel=options.RUN)
     ] = 1,
     cluster: ClusterOptions,
-    web: options.Web = False,
     as_json: options.Json = False,
 ) -> None:
     """Play runs on this machine.
@@ -85,7 +83,7 @@ def local(
     check_installed(LOCAL)
     plans = _plans(given, catalogue.resolve(env), jail=jail)
     where = options.cluster_of(cluster, None, None, local=True)
-    _play(plans, where, parallel, as_json, web=web)
+    _play(plans, where, parallel, as_json)
 
 
 @app.command(epilog="Example: evopolicy demo")
@@ -234,8 +232,8 @@ def _plans(given: RunOptions, env_ids: list[str], agent_host: str = "", **more: 
     return plans
 
 
-def _play(plans: list[Plan], where: Cluster, parallel: int, as_json: bool, *, web: bool = False) -> None:
-    where = msgspec.structs.replace(where, unjailed=_unjailed(plans), web=plans[0].runs if web else None)
+def _play(plans: list[Plan], where: Cluster, parallel: int, as_json: bool) -> None:
+    where = msgspec.structs.replace(where, unjailed=_unjailed(plans))
     console = terminal(stderr=as_json)
     try:
         played = run_to_end(plain_runs.play_plans(plans, where, parallel, console))

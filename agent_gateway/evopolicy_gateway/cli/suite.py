@@ -83,7 +83,6 @@ def suite(
             help={"state": "State folder of the local cluster; default: .cluster in the sweep's folder."},
         ),
     ],
-    web: options.Web = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print events as JSON lines.")] = False,
 ) -> None:
     """Play a sweep: agents × environments × repeats.
@@ -108,7 +107,7 @@ def suite(
         chosen = msgspec.structs.replace(where.local, state=None if new and dry_run else kept)
         where = msgspec.structs.replace(where, local=chosen)
     patient = not local and (root / INDEX).exists()
-    where = msgspec.structs.replace(where, patient=patient, web=root if web else None)
+    where = msgspec.structs.replace(where, patient=patient)
     where.check_cases(run.settings for run in expanded)
     try:
         code = run_to_end(_suite(wanted, expanded, root, where, changed, dry_run, as_json))

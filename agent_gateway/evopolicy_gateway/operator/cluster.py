@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import sys
-import time
 from collections.abc import AsyncIterator, Collection, Iterable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -19,17 +17,12 @@ from evopolicy_common.local.cluster import LocalCluster, Workers, local_cluster
 from evopolicy_common.messages.environment import Split
 from evopolicy_common.messages.episode import Tier
 from evopolicy_common.messages.run_settings import RunSettings
-from evopolicy_common.processes.child_process import ChildProcess, last_words
-from evopolicy_common.processes.scratch import scratch_folder
 from evopolicy_common.terminal import say
 from evopolicy_common.wire import transport
 from evopolicy_common.wire.credentials import Credentials
 from evopolicy_gateway.run.operations import Operations, find_credentials
 from evopolicy_gateway.run.run_options import ClusterOptions
 
-_START_TIMEOUT_S = 60.0
-_POLL_S = 0.05
-_GRACE_S = 5.0
 CONNECT_S = 10.0
 """Patience with a coordinator that was not reached yet, seconds."""
 
@@ -46,8 +39,6 @@ class Cluster(msgspec.Struct, frozen=True, kw_only=True):
     """For a local cluster with a state: its agents have no jail and could read that state."""
     patient: bool = False
     """The command continues earlier work, and waits for a coordinator that is away."""
-    web: Path | None = None
-    """Folder of runs that a live view shows meanwhile; None for no view."""
 
     def check_cases(self, runs: Iterable[RunSettings]) -> None:
         """Raises ConfigError when a local cluster lacks the case files that a run plays."""
@@ -95,8 +86,6 @@ async def reached(where: Cluster, workers: Workers | None = None) -> AsyncIterat
         operator, gateway = find_credentials(where.connect, file)
         timeout_s = None if where.patient else CONNECT_S
         link = await stack.enter_async_context(transport.connect(operator, timeout_s=timeout_s))
-        if where.web is not None:
-            await stack.enter_async_context(live_view(where.web, where.connect, file))
         yield Reached(Operations(link, opened), gateway, local)
 
 
@@ -109,34 +98,3 @@ async def connected(
     workers = None if where.local is None else Workers(env_ids, where.local.slots, tiers)
     async with reached(where, workers) as (operations, gateway, local):
         yield operations, gateway, None if local is None else local.failed
-
-
-@contextlib.asynccontextmanager
-async def live_view(root: Path, connect: Sequence[str], file: Path | None) -> AsyncIterator[None]:
-    """Shows the runs in `root` and the cluster; prints the URL. ConfigError if it does not start."""
-    root.mkdir(parents=True, exist_ok=True)
-    with scratch_folder("view") as folder:
-        address, log = folder / "address", folder / "view.log"
-        program = [sys.executable, "-P", "-m", "evopolicy_gateway.cli", "web", str(root)]
-        program += ["--http", "127.0.0.1:0", "--url-file", str(address)]
-        for endpoint in connect:
-            program += ["--connect", endpoint]
-        if file is not None:
-            program += ["--credentials", str(file)]
-        child = await ChildProcess.start(program, log)
-        late = time.monotonic() + _START_TIMEOUT_S
-        try:
-            while not address.exists():
-                if child.exit_code is not None:
-                    raise ConfigError(f"--web: {last_words(log) or 'the view ended at its start'}")
-                if time.monotonic() > late:
-                    raise ConfigError(
-                        f"--web: the view did not start within {_START_TIMEOUT_S:g} s; leave out --web, and start it"
-                        f" with `evopolicy web {root}`"
-                    )
-                await asyncio.sleep(_POLL_S)
-            say(f"view: {address.read_text()}", err=True)
-            address.unlink()  # it holds the token, and an agent without a jail can read this user's files
-            yield
-        finally:
-            await child.end(_GRACE_S)

@@ -7,14 +7,12 @@ from __future__ import annotations
 
 import asyncio
 import itertools
-import time
 from collections.abc import Awaitable, Callable, Iterator
 from pathlib import Path
 from typing import Annotated, Literal, TypeVar
 
 import typer
 from rich.console import Group, RenderableType
-from rich.live import Live
 from rich.text import Text
 
 from evopolicy_common.cli.conventions import Connect, CredentialsFile, Json
@@ -42,40 +40,15 @@ def asking(connect: list[str] | None, file: Path | None, work: Callable[[Operato
 
 
 @status_app.callback(
-    invoke_without_command=True, epilog="Example: evopolicy status --watch --credentials operator-me"
+    invoke_without_command=True, epilog="Example: evopolicy status --credentials operator-me"
 )
-def status(
-    connect: Connect = None,
-    file: CredentialsFile = None,
-    as_json: Json = False,
-    watch: Annotated[bool, typer.Option("--watch", help="Refresh every second until Ctrl-C.")] = False,
-) -> None:
-    """Show workers, runs, and the reasons why runs wait.
-
-    --watch --json prints one line of JSON every second.
-    """
-    if watch:
-        asking(connect, file, _watch_lines if as_json else _watch)
-        return
+def status(connect: Connect = None, file: CredentialsFile = None, as_json: Json = False) -> None:
+    """Show workers, runs, and the reasons why runs wait."""
     reply = asking(connect, file, OperatorClient.status)
     if as_json:
         say_json(reply)
     else:
         terminal().print(render(reply))
-
-
-async def _watch(operator: OperatorClient) -> None:
-    with Live(console=terminal(), auto_refresh=False) as live:
-        while True:
-            started = time.monotonic()
-            live.update(render(await operator.status()), refresh=True)
-            await asyncio.sleep(max(0.0, 1.0 - (time.monotonic() - started)))
-
-
-async def _watch_lines(operator: OperatorClient) -> None:
-    while True:
-        say_json(await operator.status(), indent=False)
-        await asyncio.sleep(1.0)
 
 
 WorkerName = Annotated[

@@ -16,7 +16,6 @@ import typer
 from evopolicy_common.cli.conventions import Connect, CredentialsFile, end_on_sigterm, setup_logging
 from evopolicy_common.cli.frame import App
 from evopolicy_common.errors import ConfigError, EvopolicyError
-from evopolicy_common.records.blobs import announcing
 from evopolicy_common.regular_files import read_given
 from evopolicy_common.terminal import say
 from evopolicy_common.wire import credentials, transport
@@ -61,9 +60,6 @@ def web(
     report: Annotated[
         Path | None, typer.Option(help="Folder of a report, for links to it.", show_default=False)
     ] = None,
-    url_file: Annotated[
-        Path | None, typer.Option(hidden=True, help="Write the address here, mode 0600.")
-    ] = None,
 ) -> None:
     """Show sweeps, runs and the cluster in a browser, live.
 
@@ -91,7 +87,7 @@ def web(
     roots = runs or [folder for folder in (Path("runs"),) if folder.is_dir()]
     token = drawn_token() if token_file is None else kept_token(token_file)
     known = _credentials(tuple(connect or ()), file)
-    with announcing(url_file) as announce, listen(host, port) as sock:
+    with listen(host, port) as sock:
         if known is not None and not (connect or file) and not asyncio.run(_is_reachable(known)):
             say("this machine's coordinator does not answer: the folders alone are shown", err=True)
             known = None
@@ -108,7 +104,6 @@ def web(
         )
 
         def ready() -> None:
-            announce((base + token).encode())
             say(f"view: {base}{token}")
             if scheme == "http" and not credentials.stays_on_machine(f"tcp/{host}:{port}"):
                 say(

@@ -4,13 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
-import os
-import pty
-import signal
-import subprocess
-import sys
 from collections.abc import Iterator
-from typing import Any
 
 import msgspec
 import pytest
@@ -142,39 +136,3 @@ async def worker_shown(operator: OperatorClient, name: str) -> WorkerStatus:
             if worker.worker == name:
                 return worker
         await asyncio.sleep(0.02)
-
-
-WATCH = "from evopolicy_coordinator.cli.status import status_app; status_app()"
-
-
-def watching(coordinator: Coordinator, *args: str, **more: Any) -> subprocess.Popen[bytes]:
-    file = coordinator.ready["credentials"]["operator"]
-    words = [sys.executable, "-c", WATCH, "--watch", *args, "--credentials", file]
-    return subprocess.Popen(words, **more)
-
-
-def test_watch_shows_the_cluster_until_interrupted(coordinator: Coordinator) -> None:
-    controller, terminal = pty.openpty()
-    env = {**os.environ, "TERM": "xterm", "COLUMNS": "150"}
-    shown = watching(coordinator, stdout=terminal, stderr=terminal, env=env, start_new_session=True)
-    os.close(terminal)
-    try:
-        seen = b""
-        while seen.count(b"cluster local") < 2:
-            seen += os.read(controller, 65536)
-        shown.send_signal(signal.SIGINT)
-        assert shown.wait(20) == 130
-    finally:
-        shown.kill()
-        shown.wait()
-        os.close(controller)
-
-
-def test_watch_as_json_prints_an_object_a_line(coordinator: Coordinator) -> None:
-    with watching(coordinator, "--json", stdout=subprocess.PIPE) as shown:
-        assert shown.stdout is not None
-        first, second = (json.loads(shown.stdout.readline()) for _ in range(2))
-        shown.send_signal(signal.SIGINT)
-    assert first["cluster"] == second["cluster"] == "local"
-    assert first["uptime_s"] < second["uptime_s"]
-    assert shown.returncode == 130
