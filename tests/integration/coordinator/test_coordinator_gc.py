@@ -4,9 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import os
-import shutil
-import subprocess
-import sys
 import time
 from pathlib import Path
 
@@ -14,12 +11,10 @@ import msgspec
 import pytest
 from coordinator_harness import (
     Coordinator,
-    GatewayClient,
     bundle_of,
     gateway_of,
     operator_of,
     play,
-    run,
     working,
 )
 from typer.testing import CliRunner
@@ -27,7 +22,6 @@ from typer.testing import CliRunner
 from evopolicy_common.errors import ConfigError, StorageError
 from evopolicy_common.messages.episode import BlobRef, EpisodeOutcome, EpisodeSpec, Job
 from evopolicy_common.records.blobs import BlobStore, digest_of
-from evopolicy_common.wire.transport import connect
 from evopolicy_coordinator.cli import gc as gc_cli
 from evopolicy_coordinator.storage import backup, disk_use
 
@@ -44,55 +38,6 @@ async def whole_run(coordinator: Coordinator, key: str, source: str) -> str:
             await gateway.close()
         assert (await operator.finished(created.run)).status == "completed"
     return created.run
-
-
-def test_a_run_continues_from_a_backup_of_a_running_coordinator(
-    coordinator: Coordinator, tmp_path: Path
-) -> None:
-    target = tmp_path / "backup"
-
-    async def begin() -> None:
-        async with operator_of(coordinator) as operator, working(coordinator):
-            created = await operator.create(n_validation=2, n_heldout=2)
-            async with gateway_of(coordinator, created) as gateway:
-                await gateway.submit(bundle_of("one"), tuple(range(8)), "k0")
-                await gateway.results(0)
-                command = [sys.executable, "-m", "evopolicy_coordinator.cli", "backup", str(target)]
-                done = subprocess.run(
-                    [*command, "--state", str(coordinator.state)], capture_output=True, text=True, check=True
-                )
-                assert "database and 1 blob," in done.stdout
-                # What comes after the backup is lost with the disk.
-                await gateway.submit(bundle_of("lost"), (0,), "k1")
-                await gateway.results(1)
-            ids.extend((created.run, created.capability))
-
-    async def go_on() -> None:
-        run_id, capability = ids
-        assert restored.credentials("gateway") == before
-        async with operator_of(restored) as operator, working(restored), connect(before) as link:
-            gateway = GatewayClient(link, run_id, capability)
-            assert (await gateway.state()).n_submits == 1
-            episodes, done = await gateway.results(0)
-            assert (len(episodes), done.status, done.remaining_budget) == (8, "ok", 8)
-            await gateway.submit(bundle_of("two"), tuple(range(8)), "k1")
-            await gateway.results(1)
-            await gateway.close()
-            finished = await operator.finished(run_id)
-            assert finished.budget_used == 16
-            assert sorted(finished.val_scores) == [0, 1]
-
-    before, ids = coordinator.credentials("gateway"), list[str]()
-    run(begin)
-    coordinator.kill()
-    shutil.rmtree(coordinator.state)
-    shutil.copytree(target, coordinator.state)
-    coordinator.state.chmod(0o700)
-    restored = Coordinator(coordinator.state)
-    try:
-        run(go_on)
-    finally:
-        assert restored.stop() == 0
 
 
 def test_a_backup_is_whole_or_not_there(coordinator: Coordinator, tmp_path: Path) -> None:

@@ -12,7 +12,6 @@ from coordinator_harness import (
     comparable,
     gateway_of,
     operator_of,
-    play,
     run,
     working,
 )
@@ -56,29 +55,6 @@ async def test_run_goes_from_submit_to_feedback_to_held_out_score(coordinator: C
         by_split = {spec.case.seed for job in worker.jobs for spec in job.episodes}
         assert len(by_split) == 3 + 16 + 32
     assert coordinator.stop() == 0
-
-
-async def test_feedback_is_what_was_handed_in_and_nothing_more(coordinator: Coordinator) -> None:
-    async with operator_of(coordinator) as operator, working(coordinator) as worker:
-        created = await operator.create()
-        async with gateway_of(coordinator, created) as gateway:
-            bundle = bundle_of("# policy")
-            await gateway.submit(bundle, tuple(range(16)), "only")
-            episodes, done = await gateway.results(0)
-            expected = {
-                spec.index: play(job, spec)
-                for job in worker.jobs
-                for spec in job.episodes
-                if job.record == "full"
-            }
-            assert done.n_kept == 16
-            for episode in episodes:
-                outcome = expected[episode.index]
-                assert episode.episode_return == outcome.episode_return
-                assert episode.trajectory == outcome.trajectory
-                assert episode.stdout == b"hello"
-            again, _ = await gateway.results(0)
-            assert again == episodes
 
 
 def test_same_submits_give_the_same_run_whatever_the_workers(tmp_path: Path) -> None:
