@@ -1,13 +1,16 @@
 """Reads token counts from a model API's answers, in JSON or as a stream of events (SSE). No I/O.
 
-Each API is one row of `SHAPES`. An answer is whatever its sender says: a count that is no count is estimated from the
-text, at `CHARS_PER_TOKEN`, and so is one that a broken stream or a server without counts did not send.
+`apis.toml` has the form of each API's answers. An answer is whatever its sender says: a count that is no count is
+estimated from the text, at `CHARS_PER_TOKEN`, and so is one that a broken stream or a server without counts did not
+send.
 """
 
 from __future__ import annotations
 
 import re
+import tomllib
 from collections.abc import Iterable, Iterator
+from pathlib import Path
 from typing import Any
 
 import msgspec
@@ -25,79 +28,21 @@ _EVENT_END = re.compile(rb"\r\n\r\n|\n\n|\r\r")
 
 
 class Shape(msgspec.Struct, frozen=True, kw_only=True):
-    """Where an API's answers and events tell counts, as dotted paths."""
+    """Where an API's answers and events tell counts, as dotted paths; `apis.toml` explains the fields."""
 
     usage: tuple[str, ...] = ("usage",)
-    """Objects with counts; a later count replaces an earlier one."""
     counts: dict[str, tuple[str, ...]] = {}
-    """Paths within such an object by kind. Their counts are added; of cached tokens, servers tell one of these."""
     input_includes_cached: bool = True
     model: tuple[str, ...] = ("model",)
     tier: tuple[str, ...] = ("service_tier",)
-    """Service tier that served the request."""
     text: tuple[str, ...] = ()
-    """The model's own texts, for an estimate."""
     last: frozenset[str] = frozenset()
-    """`type` of the events after which no count follows."""
 
 
 FREE = Shape()
 """Of an answer that costs nothing."""
-SHAPES: dict[str, Shape] = {
-    "chat/completions": Shape(
-        usage=("usage", "choices.*.usage"),
-        counts={
-            "input": ("prompt_tokens",),
-            "cache_read": ("prompt_tokens_details.cached_tokens", "prompt_cache_hit_tokens", "cached_tokens"),
-            "output": ("completion_tokens",),
-            "reasoning": ("completion_tokens_details.reasoning_tokens",),
-        },
-        text=tuple(
-            f"choices.*.{part}.{field}"
-            for part in ("delta", "message")
-            for field in ("content", "reasoning_content", "reasoning", "tool_calls.*.function.arguments")
-        ),
-    ),
-    "responses": Shape(
-        usage=("usage", "response.usage"),
-        counts={
-            "input": ("input_tokens",),
-            "cache_read": ("input_tokens_details.cached_tokens",),
-            "output": ("output_tokens",),
-            "reasoning": ("output_tokens_details.reasoning_tokens",),
-        },
-        model=("model", "response.model"),
-        tier=("service_tier", "response.service_tier"),
-        text=("delta", "output.*.content.*.text", "output.*.arguments"),
-        last=frozenset(("response.completed", "response.incomplete", "response.failed")),
-    ),
-    "messages": Shape(
-        usage=("message.usage", "usage"),
-        counts={
-            "input": ("input_tokens",),
-            "cache_read": ("cache_read_input_tokens",),
-            "cache_creation": ("cache_creation_input_tokens",),
-            "output": ("output_tokens",),
-        },
-        input_includes_cached=False,
-        model=("model", "message.model"),
-        tier=("usage.service_tier", "message.usage.service_tier", "usage.speed", "message.usage.speed"),
-        text=("delta.text", "delta.thinking", "delta.partial_json", "content.*.text", "content.*.thinking"),
-        last=frozenset(("message_stop",)),
-    ),
-    "generateContent": Shape(
-        usage=("usageMetadata",),
-        counts={
-            "input": ("promptTokenCount", "toolUsePromptTokenCount"),
-            "cache_read": ("cachedContentTokenCount",),
-            "output": ("candidatesTokenCount", "thoughtsTokenCount"),
-            "reasoning": ("thoughtsTokenCount",),
-        },
-        model=("modelVersion",),
-        tier=("usageMetadata.serviceTier",),
-        text=("candidates.*.content.parts.*.text", "candidates.*.content.parts.*.functionCall.name"),
-    ),
-}
+APIS: dict[str, dict[str, Any]] = tomllib.loads(Path(__file__).with_name("apis.toml").read_text("utf-8"))
+SHAPES = {api: msgspec.convert(about["answer"], Shape) for api, about in APIS.items()}
 """By `apis.Route.api`."""
 
 

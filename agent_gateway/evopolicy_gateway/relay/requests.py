@@ -15,7 +15,7 @@ from typing import Any
 import msgspec
 import orjson
 
-from evopolicy_gateway.relay.answers import CHARS_PER_TOKEN, MAX_TOKENS, values
+from evopolicy_gateway.relay.answers import APIS, CHARS_PER_TOKEN, MAX_TOKENS, values
 
 ANY = None
 MAX_MARKS = 2_000_000
@@ -26,10 +26,6 @@ USUAL_TIERS = ("", "auto", "default", "standard", "standard_only")
 """Service tiers at the usual prices."""
 _TIERS = ("servicetier", "speed")
 _MAX_NAMES, _SHOWN = 20, 200
-
-
-def _fields(names: str, **nested: Any) -> dict[str, Any]:
-    return dict.fromkeys(names.split(), ANY) | nested
 
 
 class Rules(msgspec.Struct, frozen=True, kw_only=True):
@@ -46,97 +42,29 @@ class Rules(msgspec.Struct, frozen=True, kw_only=True):
     """Path of the number of answers."""
 
 
-_FUNCTION = "name description parameters strict"
-_WEB = "type name cache_control max_uses allowed_domains blocked_domains user_location defer_loading allowed_callers"
-_CLAUDES = "type name cache_control defer_loading strict allowed_callers input_examples eager_input_streaming"
-_SAMPLING = (
-    "model stream stream_options tools tool_choice parallel_tool_calls temperature top_p metadata user store"
-)
-_KEEPING = "service_tier safety_identifier prompt_cache_key prompt_cache_retention top_logprobs"
-_RESPONSES_TOOLS: dict[str, Any] = {
-    "function": _fields(f"type {_FUNCTION} defer_loading"),
-    "custom": _fields("type name description format defer_loading"),
-    "local_shell": _fields("type"),
-    "shell": _fields("type", environment={"type": "local", "skills": ANY}),
-    "apply_patch": _fields("type"),
-    "tool_search": _fields("type description parameters", execution="client"),
-    "computer": _fields("type"),
-    "computer_use_preview": _fields("type display_width display_height environment"),
-    "namespace": _fields("type name description"),
-}
-RULES: dict[str, Rules] = {
-    "chat/completions": Rules(
-        fields=_fields(
-            f"{_SAMPLING} {_KEEPING} messages max_tokens max_completion_tokens top_k min_p n stop seed logit_bias"
-            " presence_penalty frequency_penalty repetition_penalty logprobs response_format reasoning_effort"
-            " reasoning include_reasoning reasoning_split verbosity thinking enable_thinking thinking_budget"
-            " preserve_thinking clear_thinking tool_stream chat_template_kwargs modalities prediction random_seed"
-            " safe_prompt prompt_mode usage"
-        ),
-        tools={
-            "function": _fields("type cache_control", function=_fields(_FUNCTION)),
-            "custom": _fields("type", custom=_fields("name description format")),
-        },
-        most=("max_completion_tokens", "max_tokens"),
-        answers="n",
-    ),
-    "responses": Rules(
-        fields=_fields(
-            f"{_SAMPLING} {_KEEPING} input instructions max_output_tokens max_tool_calls reasoning text include"
-            " client_metadata truncation previous_response_id context_management background"
-        ),
-        tools=_RESPONSES_TOOLS,
-        hosted={
-            "web_search": _fields(
-                "type filters user_location search_context_size external_web_access search_content_types"
-            ),
-            "web_search_preview": _fields("type user_location search_context_size"),
-            "code_interpreter": _fields("type container"),
-            "file_search": _fields("type vector_store_ids max_num_results ranking_options filters"),
-        },
-        most=("max_output_tokens",),
-    ),
-    "messages": Rules(
-        fields=_fields(
-            "model messages system max_tokens stream tools tool_choice temperature top_p top_k stop_sequences metadata"
-            " thinking output_config output_format service_tier speed inference_geo context_management cache_control"
-        ),
-        tools={
-            "custom": _fields(f"{_CLAUDES} description input_schema"),
-            "bash": _fields(_CLAUDES),
-            "text_editor": _fields(f"{_CLAUDES} max_characters"),
-            "memory": _fields(_CLAUDES),
-            "computer": _fields(f"{_CLAUDES} display_width_px display_height_px display_number enable_zoom"),
-        },
-        hosted={
-            "web_search": _fields(_WEB),
-            "web_fetch": _fields(f"{_WEB} citations max_content_tokens"),
-            "code_execution": _fields("type name cache_control"),
-            "tool_search_tool_regex": _fields("type name cache_control"),
-            "tool_search_tool_bm25": _fields("type name cache_control"),
-        },
-        most=("max_tokens",),
-    ),
-    "generateContent": Rules(
-        fields=_fields(
-            "contents systemInstruction generationConfig safetySettings tools toolConfig labels serviceTier"
-        ),
-        tools={
-            "functionDeclarations": {
-                "functionDeclarations": [
-                    _fields(
-                        "name description behavior parameters parametersJsonSchema parameters_json_schema response"
-                        " responseJsonSchema response_json_schema"
-                    )
-                ]
-            },
-            "computerUse": {"computerUse": _fields("environment excludedPredefinedFunctions")},
-        },
-        hosted={kind: {kind: ANY} for kind in ("googleSearch", "urlContext", "codeExecution")},
-        most=("generationConfig.maxOutputTokens", "generation_config.max_output_tokens"),
-        answers="generationConfig.candidateCount",
-    ),
-}
+def _template(about: Any) -> Any:
+    """A template as `apis.toml` writes it."""
+    if isinstance(about, str):
+        return dict.fromkeys(about.split(), ANY)
+    if isinstance(about, list):
+        return [_template(about[0])]
+    if "is" in about:
+        return about["is"]
+    nested = {name: _template(each) for name, each in about.items() if name != "_"}
+    return dict.fromkeys(about.get("_", "").split(), ANY) | nested
+
+
+def _rules(about: dict[str, Any]) -> Rules:
+    return Rules(
+        fields=_template(about["fields"]),
+        tools=_template(about["tools"]),
+        hosted=_template(about.get("hosted", {})),
+        most=tuple(about["most"]),
+        answers=about.get("answers", ""),
+    )
+
+
+RULES = {api: _rules(about) for api, about in APIS.items()}
 RULES["messages/count_tokens"] = RULES["messages"]
 RULES["countTokens"] = RULES["generateContent"]
 _HOSTED_FIELDS = (
