@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import tomllib
 from collections.abc import Iterable, Mapping, Sequence
+from importlib.resources import files
 from typing import Any, NamedTuple
 
 from markupsafe import Markup, escape
@@ -44,72 +46,8 @@ class _Section(NamedTuple):
     text: str = ""
 
 
-_SECTIONS = (
-    _Section(
-        "returns", "Returns", "How much does each agent return on each environment?", tables="heldout cells"
-    ),
-    _Section(
-        "leaderboard",
-        "Leaderboard",
-        "Who ranks first over all environments?",
-        "rank_scores_*",
-        "leaderboard incomplete",
-    ),
-    _Section(
-        "statistics",
-        "Statistics",
-        "Which differences are real, and how small a difference can these runs show?",
-        "profiles_*",
-        "pairs resolution aggregates improvement generalisation",
-    ),
-    _Section(
-        "starts",
-        "Runs from one state",
-        "How do runs differ that start from the same submit?",
-        tables="starts",
-    ),
-    _Section(
-        "worlds",
-        "Worlds",
-        "Do the agents rely on rules that they did not confirm?",
-        "worlds",
-        "worlds",
-        "A world is the environment with altered rules. A lower score there shows knowledge that these rules do not"
-        " confirm, or too little exploration: compare with agents that know nothing of the environments.",
-    ),
-    _Section(
-        "evolution", "Score evolution", "How fast does each agent improve?", "score_evolution_*", "evolution"
-    ),
-    _Section(
-        "demand",
-        "Task demand",
-        "Which agents build machinery, and which tune constants?",
-        "normalised_*",
-        "normalised",
-        "Synthesis-dominant tasks need machinery (perception, memory, planning); tuning-dominant ones mostly need the"
-        " right constants. This is one way to read the results, not a classification of tasks.",
-    ),
-    _Section("edits", "Edits", "Which kinds of edits help?", "edit_hits edit_size", "edit_types edit_sizes"),
-    _Section("timelines", "Timelines", "When did each run change its approach?"),
-    _Section("structure", "Structure", "How large are the selected policies?", "structure", "structure"),
-    _Section(
-        "cost",
-        "Cost and audit",
-        "How many tokens and how much time did the runs use?",
-        "tokens wall_time",
-        "tokens audit",
-    ),
-    _Section(
-        "feedback",
-        "Runs",
-        "How did one run go?",
-        text="Each run has a page: what its agent read and said before every submit, what it changed, and what came of"
-        " it, with all checkpoints and their differences.",
-    ),
-    _Section("replays", "Replays", "How do the selected policies look at work?"),
-    _Section("setup", "Setup", "Which settings did the runs have?", tables="agents environments not_told"),
-    _Section("left-out", "Left out", "Which folders are not in this report?"),
-)
+_PLAN = files("evopolicy_results.html").joinpath("templates", "sections.toml").read_text("utf-8")
+_SECTIONS = [_Section(**about) for about in tomllib.loads(_PLAN)["section"]]
 
 
 def index_page(

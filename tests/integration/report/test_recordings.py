@@ -28,54 +28,7 @@ pytestmark = pytest.mark.system
 TIMEOUT_S = 600.0
 ENVIRONMENTS = ("toy/line", "gymnasium/FetchPickAndPlace-v4")
 """The second one's episode is another when it is drawn without care."""
-SUITE = """
-name = "t"
-environments = ["toy/line", "gymnasium/FetchPickAndPlace-v4"]
-[defaults]
-budget = 3
-validation = 1
-heldout = 2
-[[agents]]
-name = "plain"
-agent = "replay:policies"
-[[agents]]
-name = "filmed"
-agent = "replay:policies"
-[agents.run]
-replays = "all"
-[[agents]]
-name = "shown"
-agent = "replay:policies"
-environments = ["toy/line"]
-[agents.run]
-video = "first"
-[[agents]]
-name = "shown all"
-agent = "replay:policies"
-environments = ["toy/line"]
-[agents.run]
-video = "all"
-replays = "off"
-
-[[agents]]
-name = "codex"
-environments = ["toy/line"]
-[agents.config]
-harness = "codex"
-program = ["{python}", "{fakes}/codex"]
-environment = { FAKE_STATE = ".fake", FAKE_SCENARIO = "evolves" }
-[agents.jail]
-read = ["{fakes}"]
-[[agents]]
-name = "claude"
-environments = ["toy/line"]
-[agents.config]
-harness = "claude-code"
-program = ["{python}", "{fakes}/claude"]
-environment = { FAKE_STATE = ".fake", FAKE_SCENARIO = "evolves" }
-[agents.jail]
-read = ["{fakes}"]
-"""
+SUITE = Path(__file__).with_name("recordings.toml").read_text()
 FAKES = Path(__file__).parents[2] / "support" / "fake_clis"
 POLICY = """
 class Policy:

@@ -34,50 +34,7 @@ budget = 8
 name = "evolve"
 agent = "evolve"
 """
-GOLDEN_INDEX = """{
-  "schema_version": 1,
-  "suite": "s",
-  "updated_at": "",
-  "runs": {
-    "evolve/toy/line/0": {
-      "name": "evolve/toy/line/0",
-      "agent": "evolve",
-      "env": "toy/line",
-      "repeat": 0,
-      "digest": "f6b6e349fa3cfde6",
-      "settings": {
-        "agent": "evolve",
-        "config": null,
-        "settings": {
-          "env": "toy/line",
-          "entry": "evolve",
-          "model": "evolve",
-          "exp_id": "s-0",
-          "budget": 8,
-          "notes": {
-            "suite": "s"
-          }
-        },
-        "agent_wall_s": 43200.0
-      },
-      "state": "completed",
-      "attempt": 1,
-      "directory": "evolve/toy_line/s-0",
-      "run": "r",
-      "host": "h",
-      "score": 2.0,
-      "random": 0.5,
-      "n_submits": 2,
-      "budget_used": 8,
-      "tokens": null,
-      "earlier": null,
-      "closed_reason": "budget_spent",
-      "error": null,
-      "wall_s": 12.5,
-      "finished_at": "1970-01-01T00:01:52.500000Z"
-    }
-  }
-}"""
+GOLDEN_INDEX = Path(__file__).with_name("golden_index.json").read_text().rstrip()
 """Of version 1, which later versions go on with: hosts of a sweep may be of several."""
 NEVER_PLAYED = {
     "status": "no_ok_submit",
