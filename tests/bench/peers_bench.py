@@ -171,7 +171,7 @@ def main() -> None:
             if isinstance(bare, str):
                 raise SystemExit(f"the bare loop of {env} {bare}")
             row: dict[str, Any] = {"bare": bare["seconds"], "steps": bare["steps"]}
-            row["evopolicy"] = submit_time(env, n, accelerations=True)[0]
+            row["evopolicy"] = submit_time(env, n, accelerations=True)
             for peer, (_, program) in PEERS.items():
                 if peer in skipped:
                     continue

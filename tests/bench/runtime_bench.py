@@ -2,15 +2,13 @@
 
 Prints, per environment of Core16 and for one of each family: the bare loop's time per step; the slot's time over the
 bare loop's with accelerations off and on, for Core16 also over the limit of `limit.py`; and a whole submit on
-two slots, from POST to committed feedback, over (bare time / 2). Then the geometric means, a pipe's round trip on one
-core, the slot's overhead per step in such round trips, its overhead per episode, its memory, and what a one-episode
-submit takes beside its episode. At last a second small submit on two slots, over the bare loop on one core.
+two slots, from POST to committed feedback, over (bare time / 2). Then the geometric means, and the paces of web pages.
+At last a second small submit on two slots, over the bare loop on one core.
 """
 
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import json
 import math
 import os
@@ -33,15 +31,11 @@ from evopolicy_common.catalogue import installs
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.messages.environment import Case
 from evopolicy_common.messages.episode import EpisodeSpec, Job
-from evopolicy_common.processes import proc
 from evopolicy_worker.slots.slot import Slot
 
 HERE = Path(__file__).parent
 ACCELERATIONS = "EVOPOLICY_ACCELERATIONS"
 AGENT = HERE / "submit_agent.py"
-TOY_EPISODES = 200
-SINGLES = 10
-"""One-episode submits of an environment, as `submit_agent.py` makes them."""
 SMALL_SUBMITS = {
     "gym/acrobot": (32, 0.9, 2.0),
     "gym/reacher5": (32, 1.5, 2.8),
@@ -85,29 +79,6 @@ def quietly(command: list[str], **environment: str) -> str:
     return done.stdout
 
 
-def pipe_round_trip_s(n: int = 20_000) -> float:
-    """Seconds for one byte to a child process on the same core and back."""
-    core = sorted(os.sched_getaffinity(0))[0]
-    to_child, from_parent = os.pipe()
-    to_parent, from_child = os.pipe()
-    pid = os.fork()
-    if pid == 0:
-        os.sched_setaffinity(0, {core})
-        for _ in range(n):
-            os.write(from_child, os.read(to_child, 1))
-        os._exit(0)
-    before = os.sched_getaffinity(0)
-    os.sched_setaffinity(0, {core})
-    started = time.perf_counter()
-    for _ in range(n):
-        os.write(from_parent, b"x")
-        os.read(to_parent, 1)
-    seconds = time.perf_counter() - started
-    os.sched_setaffinity(0, before)
-    os.waitpid(pid, 0)
-    return seconds / n
-
-
 def jobs(env: str, n: int) -> list[Job]:
     return [
         Job(
@@ -123,31 +94,8 @@ def jobs(env: str, n: int) -> list[Job]:
     ]
 
 
-def fsync_s(n: int = 50) -> float:
-    """Median seconds for writing 4 KiB to a file and having it on the disk."""
-    times = []
-    with tempfile.NamedTemporaryFile(prefix="evopolicy-bench-") as file:
-        for _ in range(n):
-            started = time.perf_counter()
-            file.write(bytes(4096))
-            file.flush()
-            os.fsync(file.fileno())
-            times.append(time.perf_counter() - started)
-    return statistics.median(times)
-
-
-def peak_memory_mb() -> float:
-    """The peaks of this process's descendants (a slot's environment process, its zygote, its sandbox), added up."""
-    found = 0.0
-    for pid in proc.descendants(os.getpid()):
-        with contextlib.suppress(OSError), open(f"/proc/{pid}/status") as lines:
-            found += sum(int(line.split()[1]) / 1024 for line in lines if line.startswith("VmHWM:"))
-    return found
-
-
-async def slot_time(env: str, n: int, *, accelerations: bool) -> tuple[float, int, list[float], float]:
-    """`n` episodes through one pinned, sandboxed slot that is warm: seconds in all, steps, seconds of each of the
-    first episodes (of more than `n` where it is few, as single submits are held against them), peak memory in MB."""
+async def slot_time(env: str, n: int, *, accelerations: bool) -> tuple[float, int]:
+    """`n` episodes through one pinned, sandboxed slot that is warm: seconds and steps."""
     os.environ[ACCELERATIONS] = "on" if accelerations else "off"
     core = sorted(os.sched_getaffinity(0))[0]
     with tempfile.TemporaryDirectory(prefix="evopolicy-bench-") as folder:
@@ -158,13 +106,11 @@ async def slot_time(env: str, n: int, *, accelerations: bool) -> tuple[float, in
         await slot.start()
         try:
             await slot.play_job(jobs(env, 1)[0], bundle, lambda done, steps: None)
-            steps, times = 0, []
-            for index, job in enumerate(jobs(env, max(n, SINGLES))):
-                started = time.perf_counter()
+            steps, started = 0, time.perf_counter()
+            for job in jobs(env, n):
                 (outcome,) = await slot.play_job(job, bundle, lambda done, steps: None)
-                times.append(time.perf_counter() - started)
-                steps += outcome.length if index < n else 0
-            return sum(times[:n]), steps, times[:SINGLES], peak_memory_mb()
+                steps += outcome.length
+            return time.perf_counter() - started, steps
         finally:
             await slot.close()
             del os.environ[ACCELERATIONS]
@@ -180,11 +126,11 @@ def write_splits(env: str, n: int, folder: Path) -> None:
         (target / f"{split}.json").write_text(json.dumps(document))
 
 
-def submit_time(env: str, n: int, *, accelerations: bool) -> tuple[float, list[float]]:
-    """Seconds of one warm submit of `n` episodes on two slots up to committed feedback, and of one-episode submits."""
+def submit_time(env: str, n: int, *, accelerations: bool) -> float:
+    """Seconds of one warm submit of `n` episodes on two slots up to committed feedback."""
     hidden = ("--validation", "1", "--heldout", "1")
-    measured = agent_measured(env, n, n + 14, *hidden, **{ACCELERATIONS: "on" if accelerations else "off"})
-    return measured["submit_s"], measured["single_s"]
+    measured = agent_measured(env, n, n + 4, *hidden, **{ACCELERATIONS: "on" if accelerations else "off"})
+    return float(measured["submit_s"])
 
 
 def small_submit(env: str, n: int) -> dict[str, Any]:
@@ -238,13 +184,10 @@ def measure(env: str, seconds: float, most: int, *, submits: bool) -> dict[str, 
         # A collection of Python's garbage takes as long as an episode of some environments: more than a few of them.
         row |= beside_the_limit(env, max(n, min(most, LIMIT_EPISODES)))
     for name, accelerations in (("plain", False), ("accelerated", True)):
-        slot_s, steps, first, memory = asyncio.run(slot_time(env, n, accelerations=accelerations))
+        slot_s, steps = asyncio.run(slot_time(env, n, accelerations=accelerations))
         row[f"slot_{name}_s"], row[f"slot_{name}_steps"] = slot_s, steps
-        row[f"first_{name}_s"], row[f"slot_{name}_mb"] = first, memory
         if submits:
-            row[f"submit_{name}_s"], row[f"single_{name}_s"] = submit_time(
-                env, n, accelerations=accelerations
-            )
+            row[f"submit_{name}_s"] = submit_time(env, n, accelerations=accelerations)
     return row
 
 
@@ -269,7 +212,7 @@ def over(row: dict[str, Any], name: str) -> float:
     return float(row[name] / (row["bare_s"] / (2 if name.startswith("submit") else 1)))
 
 
-def report(rows: list[dict[str, Any]], round_trip_s: float, console: Console) -> dict[str, Any]:
+def report(rows: list[dict[str, Any]], console: Console) -> dict[str, Any]:
     """Prints the table and the summary; returns the summary."""
     headings = ("environment", "episodes", "bare µs/step", *RATIOS)
     table = frame.table(*headings, title="time over the bare loop's (below 1: faster)")
@@ -277,7 +220,6 @@ def report(rows: list[dict[str, Any]], round_trip_s: float, console: Console) ->
     # there.
     measured = CORE16.intersection(row["env"] for row in rows)
     ratios: dict[str, list[float]] = {}
-    overheads: list[float] = []
     for row in rows:
         cells = [row["env"], str(row["episodes"]), f"{1e6 * row['bare_s'] / row['steps']:.0f}"]
         for name in RATIOS.values():
@@ -288,48 +230,13 @@ def report(rows: list[dict[str, Any]], round_trip_s: float, console: Console) ->
             if row["env"] in CORE16 or not measured:
                 ratios.setdefault(name, []).append(ratio)
             cells.append(f"{ratio:.2f}")
-        overheads.append((row["slot_plain_s"] - row["bare_s"]) / row["steps"])
         table.add_row(*cells)
     console.print(table)
     summary: dict[str, Any] = {name: geometric_mean(values) for name, values in ratios.items()}
     if "limit_s" in summary:
         summary["slot_over_limit"] = summary.pop("limit_s")
-    counted = [row for row in rows if row["env"] in CORE16] or rows
-    bare = sum(row["bare_s"] / row["episodes"] for row in counted)
-    for name in ("slot_accelerated_s", "submit_accelerated_s"):
-        if name in ratios and all(name in row for row in counted):
-            cores = 2 if name.startswith("submit") else 1
-            summary[f"sweep_{name}"] = sum(row[name] / row["episodes"] for row in counted) / (bare / cores)
-    summary["pipe_round_trip_us"] = 1e6 * round_trip_s
     for name, value in summary.items():
         console.print(f"{name:28} {value:8.3f}")
-    singles = [
-        1000 * (submit - episode)
-        for row in rows
-        for submit, episode in zip(
-            row.get("single_accelerated_s", []), row["first_accelerated_s"], strict=False
-        )
-    ]
-    if singles:
-        summary["single_median_ms"] = statistics.median(singles)
-        summary["single_95_ms"] = statistics.quantiles(singles, n=20)[-1]
-        summary["fsync_ms"] = 1000 * fsync_s()
-        console.print(
-            f"one-episode submit without its episode, ms: median {summary['single_median_ms']:.1f}, "
-            f"95 % {summary['single_95_ms']:.1f}; one fsync here: {summary['fsync_ms']:.1f}"
-        )
-    headings = ("environment", "µs per step", "pipe round trips per step", "ms per episode", "MB", "MB, acc.")
-    table = frame.table(*headings, title="slot overhead (accelerations off), and the slot's peak memory")
-    for row, overhead in zip(rows, overheads, strict=True):
-        table.add_row(
-            row["env"],
-            f"{1e6 * overhead:.0f}",
-            f"{overhead / round_trip_s:.1f}",
-            f"{1000 * overhead * row['steps'] / row['episodes']:.1f}",
-            f"{row['slot_plain_mb']:.0f}",
-            f"{row['slot_accelerated_mb']:.0f}",
-        )
-    console.print(table)
     return summary
 
 
@@ -377,7 +284,6 @@ def main() -> None:
     if options.small_only:
         tell_small([small_submit(env, SMALL_SUBMITS[env][0]) for env in small], console)
         return
-    round_trip_s = pipe_round_trip_s()
     rows: list[dict[str, Any]] = []
     failed = []
     for env in envs:
@@ -394,15 +300,8 @@ def main() -> None:
             # One environment that fails costs its own row, not those of the others.
             console.print(f"failed: {error}", markup=False)
             failed.append(env)
-    summary = report(rows, round_trip_s, console)
+    summary = report(rows, console)
     tell_paces(rows, console)
-    # An environment that costs nothing: what is left is fork, seal, import, reset and the record.
-    toy_s, steps, _, _ = asyncio.run(slot_time("toy/line", TOY_EPISODES, accelerations=True))
-    summary["toy_episode_ms"] = 1000 * toy_s / TOY_EPISODES
-    console.print(
-        f"an episode of toy/line ({steps / TOY_EPISODES:.0f} steps) through a slot: "
-        f"{summary['toy_episode_ms']:.2f} ms"
-    )
     submits = [small_submit(env, SMALL_SUBMITS[env][0]) for env in small]
     if submits:
         tell_small(submits, console)

@@ -2,13 +2,12 @@
 
 For each environment a real worker first plays real episodes through a coordinator and a gateway to feedback on disk.
 Then workers without a simulator report the same outcomes: the real supervisor with its leases, heartbeats and result
-reports over Zenoh connections of its own, whose slots answer at once (with `--paced`: after the bare time of an
-episode). Coordinator and gateways are the real programs, a process a run. The feedback of the first and the last submit
-of every run is hashed and has to equal the real one. Prints tables; the only thing that it asserts is that hash.
+reports over Zenoh connections of its own, whose slots answer at once. Coordinator and gateways are the real programs, a
+process a run. The feedback of the first and the last submit of every run is hashed and has to equal the real one.
+Prints tables; the only thing that it asserts is that hash.
 
-CPU is the system's count for whole processes and their threads, while submits were in flight. "By CPU": slots whose
-episodes cost, without a slot, as much CPU as their results cost the process. "Busy": slots that the measured rate of
-episodes keeps busy, where an episode takes its bare time; all processes of the bench share the machine.
+CPU is the system's count for whole processes while submits were in flight. "By CPU": slots whose episodes cost, without
+a slot, as much CPU as their results cost the process. All processes of the bench share the machine.
 """
 
 from __future__ import annotations
@@ -25,7 +24,6 @@ import tempfile
 import threading
 import time
 import urllib.request
-from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -79,8 +77,6 @@ class Outcomes(msgspec.Struct):
     env: EnvironmentDescription
     by_seed: dict[int, bytes]
     """What a slot's process says of an episode (`slot_messages.Finished`), by its case's seed."""
-    pace_s: float = 0.0
-    """How long a slot takes over an episode, seconds."""
 
 
 class Played(msgspec.Struct, frozen=True):
@@ -130,7 +126,7 @@ class AnsweringSlot:
             reply = slot_messages.replies.decode(self._outcomes.by_seed[spec.case.seed])
             assert isinstance(reply, slot_messages.Finished)
             outcomes.append(msgspec.structs.replace(reply.outcome, index=spec.index))
-        await asyncio.sleep(self._outcomes.pace_s * len(outcomes))
+        await asyncio.sleep(0)
         return tuple(outcomes)
 
 
@@ -138,7 +134,6 @@ async def answer(options: Any) -> None:
     """Supervisors until the parent closes standard input."""
     folder: Path = options.answer
     outcomes = msgspec.msgpack.decode((folder / "outcomes").read_bytes(), type=Outcomes)
-    outcomes = msgspec.structs.replace(outcomes, pace_s=options.pace)
     found = credentials.read_credentials(folder / "worker.json")
     async with contextlib.AsyncExitStack() as stack:
         tasks = []
@@ -168,26 +163,6 @@ async def answer(options: Any) -> None:
 
 
 # Processes, and what they use.
-
-
-class Cpu:
-    """CPU seconds of a process and of its threads by name, from now on."""
-
-    def __init__(self, pid: int) -> None:
-        self._pid = pid
-        self._before = self._now()
-
-    def used(self) -> Counter[str]:
-        """Seconds; "" is the whole process, with threads that have ended."""
-        return self._now() - self._before
-
-    def _now(self) -> Counter[str]:
-        found: Counter[str] = Counter({"": frame.cpu_s(self._pid)})
-        for task in Path(f"/proc/{self._pid}/task").iterdir():
-            with contextlib.suppress(OSError):
-                name = (task / "comm").read_text().strip().rstrip("0123456789-")
-                found["main" if task.name == str(self._pid) else name] += frame.cpu_s(f"{task}/stat")
-        return found
 
 
 def _written(pid: int) -> int:
@@ -372,7 +347,6 @@ def answered(
     folder.mkdir()
     credentials.write(coordinator.credentials("worker"), folder / "worker.json")
     (folder / "outcomes").symlink_to(folder.parent / "outcomes")
-    pace_s = played.bare_s if options.paced else 0.0
     with contextlib.ExitStack() as stack:
         answering = []
         for number in range(options.processes):
@@ -380,7 +354,6 @@ def answered(
                 child(
                     *(__file__, "--answer", str(folder), "--process", str(number)),
                     *("--workers", str(options.workers), "--slots", str(options.slots)),
-                    *("--pace", str(pace_s)),
                     log=folder / "answering.log",
                     stdin=subprocess.PIPE,
                     stdout=subprocess.PIPE,
@@ -405,7 +378,7 @@ def answered(
         pids = {"coordinator": [coordinator.process.pid]}
         pids["gateway"] = [run.process.pid for run in runs]
         pids["supervisor"] = [process.pid for process in answering]
-        before = {what: [Cpu(pid) for pid in of] for what, of in pids.items()}
+        before = {what: sum(map(frame.cpu_s, of)) for what, of in pids.items()}
         written = _written(coordinator.process.pid)
         started = time.monotonic()
         threads = [
@@ -416,14 +389,14 @@ def answered(
         for thread in threads:
             thread.join()
         wall_s = time.monotonic() - started
-        used = {what: sum((each.used() for each in of), Counter()) for what, of in before.items()}
+        used = {what: sum(map(frame.cpu_s, of)) - before[what] for what, of in pids.items()}
         written = _written(coordinator.process.pid) - written
         hashes = {run.hash(index) for run in runs for index in (0, submits)}
         assert hashes == {played.expected(per_submit)}, f"{env}: the feedback differs from a real run's"
         latencies = sorted(latency for run in runs for latency in run.latencies)
     episodes = n_runs * submits * len(ids)
     assert len(latencies) == n_runs * submits, "a submit failed"
-    cpu_ms = {what: 1000 * cpu[""] / episodes for what, cpu in used.items()}
+    cpu_ms = {what: 1000 * cpu / episodes for what, cpu in used.items()}
     rate, bare_ms = episodes / wall_s, 1000 * played.bare_s
     return {
         "env": env,
@@ -442,11 +415,6 @@ def answered(
         # A slot takes longer than the environment alone, so these are the fewest.
         "slots_by_gateway": round(bare_ms / max(cpu_ms["gateway"], 1e-3), 1),
         "slots_by_coordinator": round(bare_ms / max(cpu_ms["coordinator"], 1e-3), 1),
-        "slots_busy": round(rate * played.bare_s, 1),
-        "threads_ms": {
-            what: {name: round(1000 * value / episodes, 3) for name, value in cpu.most_common(9) if name}
-            for what, cpu in used.items()
-        },
     }
 
 
@@ -459,8 +427,7 @@ def bench(env: str, options: Any) -> list[dict[str, Any]]:
             rows = []
             for n_runs in map(int, options.runs.split(",")):
                 rows.append(answered(coordinator, env, folder / f"n{n_runs}", n_runs, played, options))
-                values = {name: value for name, value in rows[-1].items() if name != "threads_ms"}
-                print("  ".join(f"{name} {value}" for name, value in values.items()), flush=True)
+                print("  ".join(f"{name} {value}" for name, value in rows[-1].items()), flush=True)
             return rows
         finally:
             coordinator.stop()
@@ -483,21 +450,16 @@ COLUMNS = {
     "99 %": "p99_ms",
     "slots of a run by CPU": "slots_by_gateway",
     "of a coordinator by CPU": "slots_by_coordinator",
-    "busy": "slots_busy",
 }
 
 
 def tell(rows: list[dict[str, Any]], console: Console) -> None:
-    """All rows in one table, and the CPU of each row by thread."""
+    """All rows in one table."""
     console.print(f"{os.cpu_count()} cores, load {os.getloadavg()[0]:.1f}; CPU of one core an episode")
     table = frame.table(*COLUMNS)
     for row in rows:
         table.add_row(*(str(row[name]) for name in COLUMNS.values()))
     console.print(table)
-    for row in rows:
-        for what, parts in row["threads_ms"].items():
-            line = "  ".join(f"{name} {value}" for name, value in parts.items() if value)
-            print(f"{row['env']}, {row['runs']} runs, {what} by thread, ms: {line}")
 
 
 def main() -> None:
@@ -510,7 +472,6 @@ def main() -> None:
         cases=(32, "most episodes that are really played of each environment"),
         play=(15.0, "CPU seconds of episodes that are really played"),
         megabytes=(1000.0, "most feedback of all runs of a row together"),
-        paced=(False, "slots take the bare time of an episode"),
         processes=(2, "processes of answering workers"),
         workers=(4, "workers in each, a connection a worker"),
         slots=(32, "slots of each worker"),
@@ -518,7 +479,6 @@ def main() -> None:
         json=(Path, "also write all numbers to this file"),
         answer=(Path, argparse.SUPPRESS),
         process=(int, argparse.SUPPRESS),
-        pace=(float, argparse.SUPPRESS),
     )
     if options.answer is not None:
         asyncio.run(answer(options))

@@ -20,7 +20,6 @@ NOON = 1768564800.0
 """2026-01-16 12:00:00 UTC."""
 KEY = "sk-the-real-key-0123456789"
 TOKEN = "token-of-the-run-0123456789"
-TOOLS = [{"type": "function", "function": {"name": "bash"}, "name": "bash"}]
 GEMINI = "models/m:generateContent"
 PATHS = {
     "chat/completions": "openai",
