@@ -198,15 +198,6 @@ class Page:
         self.call("Input.dispatchKeyEvent", type="keyDown", **pressed, **({"text": text} if text else {}))
         self.call("Input.dispatchKeyEvent", type="keyUp", **pressed)
 
-    def accessible(self) -> list[tuple[str, str]]:
-        """Role and name of everything that assistive technology is told of, in the page's order."""
-        nodes = self.call("Accessibility.getFullAXTree")["nodes"]
-        return [
-            (node["role"]["value"], node.get("name", {}).get("value", ""))
-            for node in nodes
-            if not node["ignored"] and "role" in node
-        ]
-
     def screenshot(self, path: Path, *, whole: bool = False) -> None:
         """PNG of the window, or of the whole page."""
         data = self.call("Page.captureScreenshot", format="png", captureBeyondViewport=whole)["data"]

@@ -5,7 +5,6 @@ from __future__ import annotations
 import base64
 import struct
 from collections.abc import Iterator
-from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -181,19 +180,6 @@ def test_page_fits_a_phone_without_sideways_scrolling(page: Page, report: Path) 
         assert page.run("window.innerWidth") == 390
 
 
-def test_everything_interactive_has_a_name_and_headings_descend_in_steps(index: Page) -> None:
-    nameless = index.run(
-        "[...document.querySelectorAll('button, input, select, a, figure svg, [role=region]')].filter((e) =>"
-        " !(e.textContent.trim() || e.getAttribute('aria-label') || (e.labels && e.labels.length))).map((e) =>"
-        " e.outerHTML)"
-    )
-    assert nameless == []
-    levels = index.run("[...document.querySelectorAll('h1, h2, h3, h4')].map((h) => Number(h.tagName[1]))")
-    assert levels[0] == 1
-    assert all(after - before <= 1 for before, after in pairwise(levels))
-    assert index.run("document.documentElement.lang") == "en"
-
-
 def test_everything_can_be_reached_and_worked_by_keyboard(index: Page) -> None:
     focused = "document.activeElement"
     index.press("Tab")
@@ -235,40 +221,10 @@ def test_everything_can_be_reached_and_worked_by_keyboard(index: Page) -> None:
     assert index.run(f"{scroller}.scrollLeft") > 0
 
 
-def test_screen_reader_is_told_the_name_of_every_table_figure_and_control(page: Page, report: Path) -> None:
-    named = {"button", "link", "table", "image", "searchbox", "combobox", "region", "navigation"}
-    named |= {"columnheader", "rowheader"}
+@pytest.mark.parametrize("dark", [False, True])
+def test_names_headings_landmarks_and_contrast_have_no_faults(page: Page, report: Path, dark: bool) -> None:
     for path in [report / "index.html", sorted((report / "traces").glob("*.html"))[0]]:
-        page.look()
+        page.look(dark=dark)
         page.open(path)
         page.run(UNFOLD)
-        tree = page.accessible()
-        assert [(role, name) for role, name in tree if role in named and not name.strip()] == []
-        assert [role for role, _ in tree].count("main") == 1
-        regions = [name for role, name in tree if role in ("region", "navigation")]
-        assert len(regions) == len(set(regions)), "two places of one name"
-    page.open(report / "index.html")
-    page.run(UNFOLD)
-    tree = page.accessible()
-    figures = len(
-        page.run("[...document.querySelectorAll('figure:not([hidden]) svg[role=img]')].map((e) => e.id)")
-    )
-    assert sum(role == "image" for role, _ in tree) == figures
-    assert sum(role == "table" for role, _ in tree) >= 10
-
-
-def test_text_has_enough_contrast_in_both_themes(page: Page, report: Path) -> None:
-    script = """(() => {
-      const value = (name) => { const e = document.createElement('i'); e.style.color = `var(--${name})`; document.body.append(e);
-        const rgb = getComputedStyle(e).color.match(/[\\d.]+/g).slice(0, 3).map((c) => c / 255); e.remove();
-        const [r, g, b] = rgb.map((c) => c <= 0.03928 ? c / 12.92 : ((c + 0.055) / 1.055) ** 2.4);
-        return 0.2126 * r + 0.7152 * g + 0.0722 * b; };
-      const ratio = (a, b) => { const [x, y] = [value(a), value(b)].sort((p, q) => q - p); return (x + 0.05) / (y + 0.05); };
-      return [['ink', 'bg'], ['muted', 'bg'], ['link', 'bg'], ['ink', 'panel'], ['muted', 'panel'], ['link', 'panel'],
-        ['ink', 'ins'], ['ink', 'del'], ['muted', 'hunk'], ['ink', 'warn-bg']].map(([a, b]) => [a, b, ratio(a, b)]);
-    })()"""  # noqa: E501
-    for dark in (False, True):
-        page.look(dark=dark)
-        page.open(report / "index.html")
-        for front, back, ratio in page.run(script):
-            assert ratio >= 4.5, (front, back, ratio, "dark" if dark else "light")
+        assert page.violations() == []
