@@ -2,9 +2,9 @@
 
 The run's finaliser writes it; reports and `verify` read it. It is written once and last, after the agent and its
 children have ended, because it holds hidden scores. It has the published fields in their published meaning, and more.
-Readers skip unknown fields, and a field added later has a default; a file with a higher `record_version` than ours is
-refused. Files of version 1, whose `schema_version` is the number 1, are converted on reading. Paths are relative to the
-run directory. Times are UTC texts as `summary.utc_text` writes them; durations are seconds.
+Readers skip unknown fields, and a field added later has a default; a file with another `record_version` than ours is
+refused. Paths are relative to the run directory. Times are UTC texts as `summary.utc_text` writes them; durations are
+seconds.
 """
 
 from __future__ import annotations

@@ -83,8 +83,8 @@ class CheckResult(msgspec.Struct, kw_only=True):
     memory_mb: int = 0
     """Peak memory of the process, MiB."""
     rendered: str = ""
-    """`same`: an episode that is drawn is the same. `none`: it is never drawn. Empty: not tried, as in older results,
-    or where this machine cannot draw."""
+    """`same`: an episode that is drawn is the same. `none`: it is never drawn. Empty: not tried,
+    as this machine cannot draw."""
 
     def verdict(self, other: CheckResult | None) -> str:
         """`ok`, or all violations. `other`: the result in another process."""
