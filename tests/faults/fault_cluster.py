@@ -25,7 +25,7 @@ from cryptography.fernet import Fernet
 from host_faults import Cable, Clock, Disks
 from machines.own_processes import only_what_starts_inside
 from machines.postgres import Server
-from weak_link import WeakLink
+from machines.weak_link import WeakLink
 
 from evopolicy_common.messages import operator
 from evopolicy_common.processes import proc

@@ -35,7 +35,7 @@ from fault_cluster import EPISODES, SUBMITS, TIMEOUT_S, TOTAL, FaultCluster, Sit
 from host_faults import enter_namespaces, full_file_system, out_of_memory, read_only_mount
 from machines.cgroups import NoCgroupError
 from machines.postgres import Server, programs
-from weak_link import How
+from machines.weak_link import How
 
 from evopolicy_common.errors import RefusedError, TransportError
 from evopolicy_common.messages import operator

@@ -32,6 +32,7 @@ from coordinator_harness import (
 from cryptography.fernet import Fernet
 from machines.own_certs import CLUSTER, DAYS, free_port, now, of
 from machines.postgres import Server
+from machines.weak_link import WeakLink
 from prometheus_client import CollectorRegistry
 from rich.console import Console
 
@@ -315,14 +316,15 @@ def test_a_paused_leader_that_wakes_up_writes_nothing(
 def test_a_leader_cut_from_the_database_stops_answering(
     tmp_path: Path, server: Server, calm: tuple[Path, dict[str, Any]]
 ) -> None:
-    """All its packets to the server are held by a proxy; its clients still reach it."""
+    """All its packets to the server are held on the way; its clients still reach it."""
     secret, expected = calm
 
-    with Proxy(server.port) as proxy, pair_of(tmp_path, secret, server.new()) as pair:
+    held = WeakLink(("127.0.0.1", 0), ("127.0.0.1", server.port))
+    with contextlib.closing(held), pair_of(tmp_path, secret, server.new()) as pair:
         pair.members[0].kill()
         pair.leads_after(1)
         pair.members[1].kill()
-        through = pair.address.replace(f":{server.port}/", f":{proxy.port}/")
+        through = pair.address.replace(f":{server.port}/", f":{held.port}/")
         server.passfile.write_text(server.passfile.read_text().replace(str(server.port), "*", 1))
         (tmp_path / "state-0" / "store").write_text(f"{through}\n")
         pair.members[0] = pair.started(0, wait=True, address=through)
@@ -332,53 +334,15 @@ def test_a_leader_cut_from_the_database_stops_answering(
                 created = await patiently(operator.create)
                 client = gateway_of(created)
                 assert (await client.state()).remaining_budget > 0
-                proxy.held.set()
-                with contextlib.suppress(TransportError):
-                    while True:
-                        await operator.ask.once("status", StatusRequest(token=operator.token), StatusReply)
-                        await asyncio.sleep(0.2)
-                while "has not confirmed the lead" not in pair.members[0].log.read_text():
-                    await asyncio.sleep(0.05)
-                proxy.held.clear()
+                with held.weak("stalled"):
+                    with contextlib.suppress(TransportError):
+                        while True:
+                            await operator.ask.once(
+                                "status", StatusRequest(token=operator.token), StatusReply
+                            )
+                            await asyncio.sleep(0.2)
+                    while "has not confirmed the lead" not in pair.members[0].log.read_text():
+                        await asyncio.sleep(0.05)
                 assert await played(operator, gateway_of) == expected
 
         run(scenario, 180)
-
-
-class Proxy:
-    """Forwards connections to a port of this machine, and while `held` is set, nothing."""
-
-    def __init__(self, target: int) -> None:
-        self._target = target
-        self.held = threading.Event()
-        self._opened: list[socket.socket] = []
-        self._listener = socket.create_server(("127.0.0.1", 0))
-        self.port = self._listener.getsockname()[1]
-        threading.Thread(target=self._accept, daemon=True).start()
-
-    def __enter__(self) -> Proxy:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._listener.close()
-        for each in self._opened:
-            each.close()
-
-    def _accept(self) -> None:
-        with contextlib.suppress(OSError):
-            while True:
-                ours, _ = self._listener.accept()
-                theirs = socket.create_connection(("127.0.0.1", self._target))
-                self._opened += (ours, theirs)
-                for source, sink in ((ours, theirs), (theirs, ours)):
-                    threading.Thread(target=self._forward, args=(source, sink), daemon=True).start()
-
-    def _forward(self, source: socket.socket, sink: socket.socket) -> None:
-        with contextlib.suppress(OSError):
-            while data := source.recv(1 << 16):
-                while self.held.is_set():
-                    time.sleep(0.05)
-                sink.sendall(data)
-        for each in (source, sink):
-            with contextlib.suppress(OSError):
-                each.shutdown(socket.SHUT_RDWR)

@@ -1,5 +1,4 @@
-"""A link to the coordinator that can be cut, stalled, slowed or garbled: bytes passed on between sockets, unix or
-TCP."""
+"""A link to a server that can be cut, stalled, slowed or garbled: bytes passed on between sockets, unix or TCP."""
 
 from __future__ import annotations
 
@@ -60,6 +59,9 @@ class WeakLink:
     def port(self) -> int:
         return int(self._listener.getsockname()[1])
 
+    def carried(self, data: bytes, *, outward: bool) -> None:
+        """Sees each piece before it goes on. `outward`: from a client."""
+
     def close(self) -> None:
         self._listener.close()
         self._flows.set()
@@ -90,11 +92,13 @@ class WeakLink:
             with self._lock:
                 self._open |= {near, far}
             for source, target in ((near, far), (far, near)):
-                threading.Thread(target=self._pass, args=(source, target), daemon=True).start()
+                ends = (source, target, source is near)
+                threading.Thread(target=self._pass, args=ends, daemon=True).start()
 
-    def _pass(self, source: socket.socket, target: socket.socket) -> None:
+    def _pass(self, source: socket.socket, target: socket.socket, outward: bool) -> None:
         with contextlib.suppress(OSError):
             while data := source.recv(1 << 16):
+                self.carried(data, outward=outward)
                 self._flows.wait()
                 if self._slow:
                     time.sleep(SLOW_S)
