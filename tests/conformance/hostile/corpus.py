@@ -1,7 +1,7 @@
 """The corpus of hostile policies: what each does, the verdict it must get, and how its defence is switched off.
 
 Two kinds. *Probes* (files in `policies/`) try one attack after another and print `held: …` or `THROUGH: …`: their
-verdict is an ordinary episode in which every attempt fails. *Breakers* (`breakers.py`) misbehave at step 3 of an
+verdict is an ordinary episode in which every attempt fails. *Breakers* (`breakers.toml`) misbehave at step 3 of an
 episode, or before its first; their verdict is the failure's category. docs/explanation/hostile-policies.md is made by
 
     PYTHONPATH=tests/support python tests/conformance/hostile/corpus.py > docs/explanation/hostile-policies.md
