@@ -2,64 +2,17 @@
 
 from __future__ import annotations
 
+import tomllib
+from pathlib import Path
+from textwrap import indent
+
 import msgspec
 import pytest
 from slots import HONEST, QUICK, Slots, acting, pid_of, rows
 from stateful_policy import kill_policy, struck
 
-SELF_MADE = {
-    "abort": "os.abort()",
-    "a segmentation fault": "ctypes.string_at(0)",
-    "a full stack": "f = ctypes.CFUNCTYPE(ctypes.c_int)(lambda: f()); sys.setrecursionlimit(1 << 30); f()",
-    "_exit": "os._exit(9)",
-    "all signals by kill": "every(lambda k: os.kill(os.getpid(), k))",
-    "all signals by raise": "every(signal.raise_signal)",
-    "all signals by pthread_kill": "every(lambda k: signal.pthread_kill(threading.get_ident(), k))",
-    "all signals by number": "every(lambda k: libc.syscall(62, os.getpid(), k))",
-    "all signals by tgkill": "every(lambda k: libc.syscall(234, os.getpid(), threading.get_native_id(), k))",
-    "all signals by tkill": "every(lambda k: libc.syscall(200, threading.get_native_id(), k))",
-    "all signals, queued": "every(lambda k: libc.syscall(129, os.getpid(), k, bytes(128)))",
-    "all signals to a group": "every(lambda k: os.killpg(0, k))",
-    "all signals to everyone": "every(lambda k: os.kill(-1, k))",
-    "SIGKILL from a timer": (
-        "timer(9); t = time.monotonic()\n            while time.monotonic() < t + 0.3: pass"
-    ),
-    "SIGSTOP from a timer": (
-        "timer(19); t = time.monotonic()\n            while time.monotonic() < t + 0.3: pass"
-    ),
-    "a processor limit of its own": (
-        "resource.setrlimit(resource.RLIMIT_CPU, (1, 1))\n            while True: pass"
-    ),
-    "a processor limit by number": (
-        "libc.syscall(160, 0, struct.pack('<QQ', 1, 1)) and 1 / 0\n            while True: pass"
-    ),
-    "a processor limit from an address of which half is nought": (
-        "at = libc.mmap(1 << 40, 4096, 3, 0x32, -1, 0); ctypes.memmove(at, struct.pack('<QQ', 1, 1), 16)\n"
-        "            libc.prlimit(0, 0, ctypes.c_void_p(at), None) and 1 / 0\n            while True: pass"
-    ),
-    "a parent's death signal": "libc.prctl(1, 9) and 1 / 0",
-    "a strict filter": "libc.prctl(22, 1) and 1 / 0\n            os.getppid()",
-    "becoming nothing": "os.execv('/bin/false', ['false'])",
-    "a call of the other architecture": "run(b'\\x6a\\x14\\x58\\xcd\\x80\\xc3')",
-    "an illegal instruction": "run(b'\\x0f\\x0b')",
-    "a halt": "run(b'\\xf4')",
-    "more memory than there may be": "self.a = bytearray(1 << 40)",
-    "all memory that there may be": "self.a = [bytearray(1 << 20) for _ in iter(int, 1)]",
-    "threads without end": "[threading.Thread(target=time.sleep, args=(9,)).start() for _ in iter(int, 1)]",
-    "files without end": "[open(f'f{k}', 'wb').write(bytes(1 << 20)) for k in range(1 << 30)]",
-    "a mapped file without room": (
-        "import mmap; f = open('/tmp/m', 'wb+'); f.truncate(3 << 20); g = open('/tmp/n', 'wb')\n"
-        "            m = mmap.mmap(f.fileno(), 3 << 20)\n            try: g.write(bytes(4 << 20)); g.flush()\n"
-        "            except OSError: pass\n            m[:] = bytes([1]) * (3 << 20)"
-    ),
-    "no pipes": "os.closerange(0, 256)",
-    "no main thread": (
-        "threading.Thread(target=lambda: (time.sleep(0.1), os.closerange(0, 256), time.sleep(9))).start()\n"
-        "            libc.syscall(60, 0)"
-    ),
-    "a broken return from a signal": "libc.syscall(15)",
-    "no address for its thread": "libc.syscall(334, 1, 32, 0, 0); run(b'\\x48\\x31\\xe4\\x50\\xc3')",
-}
+_ENDS = tomllib.loads(Path(__file__).with_name("self_made_ends.toml").read_text())
+SELF_MADE = {name: indent(code, " " * 12).strip() for name, code in _ENDS.items()}
 
 CLOCKED = acting(
     """
