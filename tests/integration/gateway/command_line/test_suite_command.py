@@ -265,6 +265,7 @@ def test_a_run_with_a_wrong_key_is_played_again(tmp_path: Path, operator_file: P
     assert (entry["state"], entry["attempt"]) == ("completed", 2)
 
 
+@pytest.mark.timeout(600)  # six commands with a local cluster each
 def test_runs_on_published_cases_stay_where_a_rerun_of_them_is_refused(tmp_path: Path) -> None:
     file, root = tmp_path / "t.toml", tmp_path / "runs" / "t"
     write_suite(tmp_path)
