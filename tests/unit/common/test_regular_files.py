@@ -25,7 +25,7 @@ def test_a_given_file_is_regular_bounded_and_may_be_behind_a_link(tmp_path: Path
         "": "not a regular file",
         "long": "larger than 10 bytes",
         "none": "No such file",
-        "nul\0": "null byte",
+        "nul\0": "null (byte|character)",
     }.items():
         with pytest.raises(ConfigError, match=f"^the list cannot be read: .*{why}.*; name a regular file"):
             read_given(tmp_path / name, "the list", 10)
