@@ -315,7 +315,8 @@ class RunOptions(PolicyPart, frozen=True, kw_only=True):
 
 
 _OTHERWISE = {"entry", "model", "exp_id", "profile", "agents_md", "prompts"}
-_AS_GIVEN = [x for x in RunSettings.__struct_fields__ if x in {*RunOptions.__struct_fields__} - _OTHERWISE]
+_OPTIONS = {*RunOptions.__struct_fields__} - _OTHERWISE
+_AS_GIVEN = [name for name in RunSettings.__struct_fields__ if name in _OPTIONS]
 """Options that are settings of the run under the same name, as they are given; None: the usual value."""
 
 

@@ -156,19 +156,18 @@ def _explained(problem: str, text: str) -> str:
         n for n, line in enumerate(text.splitlines(), 1) if re.match(rf"\s*\W*{re.escape(key)}\b", line)
     ]
     place = f", line {numbers[0]}" if len(numbers) == 1 else ""
-    known = {field.encode_name: field.type for table in _TABLES for field in msgspec.structs.fields(table)}
-    if unknown and key in known:
-        place_of_key = next(
-            where
-            for table, where in _TABLES.items()
-            if key in {f.encode_name for f in msgspec.structs.fields(table)}
-        )
-        return f"{place}: {problem}; `{key}` belongs in {place_of_key}"
-    if unknown:
-        near = difflib.get_close_matches(key, known, 1)
-        return f"{place}: {problem}" + (f"; did you mean {near[0]}?" if near else "")
-    allowed = _allowed(known.get(key))
-    return f"{place}: {problem}" + (f"; use one of {', '.join(allowed)}" if allowed else "")
+    known: dict[str, tuple[Any, str]] = {}
+    for table, where in _TABLES.items():
+        for field in msgspec.structs.fields(table):
+            known.setdefault(field.encode_name, (field.type, where))
+    kind, where = known.get(key, (None, ""))
+    if not unknown:
+        allowed = _allowed(kind)
+        return f"{place}: {problem}" + (f"; use one of {', '.join(allowed)}" if allowed else "")
+    if where:
+        return f"{place}: {problem}; `{key}` belongs in {where}"
+    near = difflib.get_close_matches(key, known, 1)
+    return f"{place}: {problem}" + (f"; did you mean {near[0]}?" if near else "")
 
 
 def _allowed(kind: Any) -> list[str]:

@@ -39,6 +39,7 @@ BUSY_TIMEOUT_S = 10.0
 _PAGE_ROWS = 10_000
 SCHEMA = 7
 """Version of the tables and of the rows in them."""
+_NAMED_AT_ONCE = 500
 NAMED, CONDEMNED = -1, -2
 """Marks of blobs in an object store: a row names it; its object is deleted. 0: no row has named it yet. Positive: a
 collection's."""
@@ -161,15 +162,17 @@ class Store:
 
     def _name(self, digests: list[str]) -> None:
         """Keeps these blobs from being collected from an object store. Raises StorageError when one has been."""
-        if not digests:
-            return
-        among = f"digest IN ({', '.join('?' * len(digests))})"
-        self._db.execute(f"UPDATE objects SET mark = {NAMED} WHERE mark > {CONDEMNED} AND {among}", digests)
-        query = f"SELECT digest FROM objects WHERE mark = {CONDEMNED} AND {among}"
-        if (gone := self._db.execute(query, digests).fetchone()) is not None:
-            raise StorageError(
-                f"blob {gone[0]} was collected before a row named it; it is to be uploaded again"
-            )
+        # In parts, since a statement has a limit of parameters.
+        for some in (
+            digests[first : first + _NAMED_AT_ONCE] for first in range(0, len(digests), _NAMED_AT_ONCE)
+        ):
+            among = f"digest IN ({', '.join('?' * len(some))})"
+            self._db.execute(f"UPDATE objects SET mark = {NAMED} WHERE mark > {CONDEMNED} AND {among}", some)
+            query = f"SELECT digest FROM objects WHERE mark = {CONDEMNED} AND {among}"
+            if (gone := self._db.execute(query, some).fetchone()) is not None:
+                raise StorageError(
+                    f"blob {gone[0]} was collected before a row named it; it is to be uploaded again"
+                )
 
     @contextlib.contextmanager
     def _transaction(self) -> Iterator[None]:

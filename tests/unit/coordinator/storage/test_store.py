@@ -9,10 +9,11 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from msgspec.structs import replace
 from rigs.store_rows import blob, outcome_row, run_row, state_row, submit_row
 
 from evopolicy_common.errors import ConfigError, DamagedStoreError, StorageError
-from evopolicy_common.messages.episode import ResourceLimits
+from evopolicy_common.messages.episode import BlobRef, ResourceLimits
 from evopolicy_coordinator.core.contract import records
 from evopolicy_coordinator.core.contract.records import (
     DocumentRow,
@@ -87,6 +88,13 @@ def test_everything_written_is_loaded_again_after_reopening(place: Place) -> Non
     assert snapshot.outcomes == (head_of(outcome),)
     assert snapshot.evaluations == (rows[4],)
     assert snapshot.workers == (rows[5],)
+
+
+def test_a_row_that_names_more_blobs_than_a_statement_has_parameters_is_written(store: Store) -> None:
+    named = tuple(BlobRef(digest=f"{number:064x}", size=1) for number in range(70_000))
+    row = replace(evaluation_row(False), replays=named)
+    store.write([row])
+    assert store.load().evaluations == (row,)
 
 
 def test_the_journal_can_only_grow(place: Place) -> None:
