@@ -90,7 +90,7 @@ def test_everything_written_is_loaded_again_after_reopening(place: Place) -> Non
     assert snapshot.workers == (rows[5],)
 
 
-def test_a_row_that_names_more_blobs_than_a_statement_has_parameters_is_written(store: Store) -> None:
+def test_a_row_may_name_more_blobs_than_a_statement_has_parameters(store: Store) -> None:
     named = tuple(BlobRef(digest=f"{number:064x}", size=1) for number in range(70_000))
     row = replace(evaluation_row(False), replays=named)
     store.write([row])
