@@ -1,4 +1,7 @@
-"""The web application: pages, their events, files, and acts. `serve` runs it until it is told to stop."""
+"""The web application: pages and files. `serve` runs it until it is told to stop.
+
+An open page asks for itself every two seconds, with the `ETag` of what it has, and replaces the parts that changed.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +19,7 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import parse_qsl
 
-from prometheus_client import CollectorRegistry, Gauge, ProcessCollector, generate_latest
+from prometheus_client import CollectorRegistry, ProcessCollector, generate_latest
 from starlette.applications import Starlette
 from starlette.middleware.gzip import GZipMiddleware
 from starlette.requests import Request
@@ -32,8 +35,7 @@ from evopolicy_common.wire.credentials import Credentials
 from evopolicy_common.wire.http import bound, serving
 from evopolicy_coordinator.web.access import Access, Guard
 from evopolicy_coordinator.web.content import rendering
-from evopolicy_coordinator.web.content.cluster import Cluster, set_within
-from evopolicy_coordinator.web.content.feeds import Feeds
+from evopolicy_coordinator.web.content.cluster import Cluster
 from evopolicy_coordinator.web.content.metrics import CONTENT_TYPE, StatusCollector
 from evopolicy_coordinator.web.content.rendering import Words
 from evopolicy_coordinator.web.content.run_detail import IMAGES, Detail
@@ -86,28 +88,23 @@ class Site:
         """`credentials` None: no cluster, only folders."""
         self.title = title
         self.access = access
-        self.feeds = Feeds()
         self.reader = Reader(roots)
         self.runs = Runs(shut=None if credentials is not None else frozenset())
         self.report = None if report is None else Confined(report)
         self.cluster: Cluster | None = None
-        self._moved = asyncio.Event()
         self._scanned_at = float("-inf")
         self._scanning = asyncio.Lock()
         self._scan_s = 0.0
         self._registry = CollectorRegistry()
         ProcessCollector(registry=self._registry)
-        browsers = Gauge("evopolicy_web_browsers", "Browsers that follow a page.", registry=self._registry)
-        browsers.set_function(lambda: self.feeds.watchers)
         if credentials is not None:
-            cluster = self.cluster = Cluster(credentials, lambda: self.feeds.watchers > 0, self._moved.set)
+            cluster = self.cluster = Cluster(credentials)
             self._registry.register(StatusCollector(lambda: cluster.status if cluster.is_known else None))
 
     @contextlib.asynccontextmanager
     async def running(self) -> AsyncIterator[None]:
-        """Keeps the data and the open pages up to date inside the `async with`."""
-        work = [self._tell()] if self.cluster is None else [self._tell(), self.cluster.run()]
-        tasks = list(map(asyncio.create_task, work))
+        """Keeps the cluster's status up to date inside the `async with`."""
+        tasks = [] if self.cluster is None else [asyncio.create_task(self.cluster.run())]
         try:
             yield
         finally:
@@ -132,20 +129,6 @@ class Site:
             self.runs = await asyncio.to_thread(self.reader.read_runs, open_runs, cluster_is_known=known)
             self._scanned_at = time.monotonic()
             self._scan_s = self._scanned_at - began
-
-    async def _tell(self) -> None:
-        while True:
-            await set_within(self._moved, _SCAN_S)
-            self._moved.clear()
-            try:
-                if self.feeds.watchers:
-                    await self.refresh()
-                for feed, view in self.feeds.watched():
-                    feed.update(await asyncio.to_thread(view))
-            except Exception:
-                # Files may change while they are read; the next scan reads them again.
-                log.exception("a page could not be updated")
-            await asyncio.sleep(0.5)
 
     # ---- views by page ----
 
@@ -190,14 +173,16 @@ class Site:
     async def live_page(
         self, request: Request, name: str, template: str, title: str, **more: Any
     ) -> Response:
-        """A page whose parts are kept up to date."""
+        """A page whose parts are kept up to date; status 304 for a browser that has it."""
         words = _words(request)
-        make = self.view_of(name, words)
-        view = await asyncio.to_thread(make)
-        feed = self.feeds.of(f"{name} {words}", make, view)
-        live = f"/events/{name}{words.link()}".removesuffix("?")
-        shown: dict[str, Any] = {"view": view, "live": live, "cursor": feed.cursor, "words": words}
-        return self._page(request, template, here=name, title=title, **shown, **more)
+        view = await asyncio.to_thread(self.view_of(name, words))
+        shown: dict[str, Any] = {"view": view, "live": " ".join(view.elements()), "words": words}
+        answer = self._page(request, template, here=name, title=title, **shown, **more)
+        etag = f'"{hashlib.sha256(answer.body).hexdigest()}"'
+        if request.headers.get("if-none-match") == etag:
+            return Response(status_code=304, headers={"etag": etag})
+        answer.headers["etag"] = etag
+        return answer
 
     async def home(self, request: Request) -> Response:
         await self.refresh()
@@ -223,17 +208,6 @@ class Site:
             **dict.fromkeys(("beside", "unplaced", "checkpoints")),
         }
         return await self.live_page(request, f"run/{run.key}", "run", title, **shown)
-
-    async def events(self, request: Request) -> Response:
-        """The updates of one page, as server-sent events."""
-        name, words = request.path_params["page"], _words(request)
-        make = self.view_of(name, words)
-        cursor = request.headers.get("last-event-id") or request.query_params.get("since", "")
-        feed = self.feeds.of(f"{name} {words}", make)
-        if feed.version == 0 or not feed.watchers:
-            feed.update(await asyncio.to_thread(make))
-        headers = {"x-accel-buffering": "no"}
-        return StreamingResponse(feed.events(cursor[:64]), media_type="text/event-stream", headers=headers)
 
     async def submit_page(self, request: Request) -> Response:
         await self.refresh()
@@ -312,7 +286,6 @@ class Site:
             Route("/run/{key}/submit/{index:int}", self.submit_page),
             Route("/run/{key}/submit/{index:int}/episode/{episode:int}", self.episode_page),
             Route("/run/{key}/file", self.file),
-            Route("/events/{page:path}", self.events),
             Route("/report/{path:path}", self.report_file),
             Route("/login", self.login, methods=["GET", "POST"]),
             Route("/static/{name}", self.static),

@@ -75,6 +75,11 @@ class View:
             self.lists[of].append(ident)
             self.parts[ident] = html
 
+    def elements(self) -> list[str]:
+        """Ids of the elements that hold the content: the lists, and the parts in none of them."""
+        listed = {name for order in self.lists.values() for name in order}
+        return [*self.lists, *(name for name in self.parts if name not in listed)]
+
 
 def page(template: str, *, view: View | None = None, own: Environment | None = None, **values: Any) -> str:
     """A page from the template of that name. In it `part(name)` and `listed(name)` put the view's parts, where it has

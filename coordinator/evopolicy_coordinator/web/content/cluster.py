@@ -11,7 +11,6 @@ import asyncio
 import contextlib
 import time
 from collections import OrderedDict
-from collections.abc import Callable
 
 from evopolicy_common.errors import EvopolicyError
 from evopolicy_common.logs import structlog
@@ -33,11 +32,9 @@ log: structlog.stdlib.BoundLogger = structlog.get_logger()
 
 
 class Cluster:
-    """The latest status of a cluster. `watched` states whether a page is open."""
+    """The latest status of a cluster."""
 
-    def __init__(
-        self, credentials: Credentials, watched: Callable[[], bool], changed: Callable[[], None]
-    ) -> None:
+    def __init__(self, credentials: Credentials) -> None:
         self.status: StatusReply | None = None
         self.trouble = ""
         """Why the coordinator does not answer; empty while it does."""
@@ -47,8 +44,6 @@ class Cluster:
         self._pause_s = 0.0
         self._at = float("-inf")
         self._credentials = credentials
-        self._watched = watched
-        self._changed = changed
         self._wake = asyncio.Event()
 
     @property
@@ -87,9 +82,10 @@ class Cluster:
             self.take_status(status)
             self._pause_s = min(_IDLE_S, max(_LEAST_PAUSE_S, _SHARE * cost_s))
             await asyncio.sleep(self._pause_s)
-            if not self._watched():
-                self._wake.clear()
-                await set_within(self._wake, _IDLE_S - self._pause_s)
+            self._wake.clear()
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout(_IDLE_S - self._pause_s):
+                    await self._wake.wait()
 
     def take_status(self, status: StatusReply) -> None:
         self.status, self._at, self.trouble = status, time.monotonic(), ""
@@ -102,17 +98,8 @@ class Cluster:
                 self.retries.move_to_end(run.run)
         while len(self.retries) > _RETRIED_RUNS:
             self.retries.popitem(last=False)
-        self._changed()
 
     def _failed(self, why: str) -> None:
         if not self.trouble:
             log.warning("the coordinator does not answer", why=why)
         self.trouble = why
-        self._changed()
-
-
-async def set_within(event: asyncio.Event, seconds: float) -> None:
-    """Waits until the event is set, or for this time."""
-    with contextlib.suppress(TimeoutError):
-        async with asyncio.timeout(seconds):
-            await event.wait()

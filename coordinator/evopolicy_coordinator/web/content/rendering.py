@@ -73,10 +73,9 @@ def part(name: str, /, **values: Any) -> str:
     return html.part(name, **values) if macro is None else str(macro(**values))
 
 
-def page(template: str, *, view: View | None = None, live: str = "", cursor: str = "", **values: Any) -> str:
-    """A whole page; `live` is where its updates come from."""
-    own = _environment()
-    return html.page(template, view=view, own=own, live=live, cursor=cursor, frame="web.html.j2", **values)
+def page(template: str, *, view: View | None = None, live: str = "", **values: Any) -> str:
+    """A whole page; `live` are the ids of the elements that are kept up to date."""
+    return html.page(template, view=view, own=_environment(), live=live, frame="web.html.j2", **values)
 
 
 def short(value: float) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import msgspec
@@ -115,3 +116,28 @@ def test_a_runs_page_hides_its_selection_while_a_related_agent_may_live(tmp_path
     for page in (shown, hidden):
         assert page.count("best so far</b>") == 1
         assert "train mean <b>-100</b>" in page
+
+
+def test_a_page_is_sent_again_only_when_it_has_changed(tmp_path: Path) -> None:
+    site = site_of(tmp_path, cluster=status(open_status("r-open")))
+    with client(site) as browser:
+        first = browser.get("/cluster?q=lab")
+        again = browser.get("/cluster?q=lab", headers={"if-none-match": first.headers["etag"]})
+        site.cluster.take_status(status(open_status("r-new")))
+        changed = browser.get("/cluster?q=lab", headers={"if-none-match": first.headers["etag"]})
+    assert (again.status_code, again.content) == (304, b"")
+    assert changed.status_code == 200
+    assert changed.headers["etag"] != first.headers["etag"]
+
+
+def test_a_page_names_each_element_that_changes_once(tmp_path: Path) -> None:
+    folder = open_run(tmp_path)
+    with client(site_of(tmp_path, cluster=status(open_status("r-open")))) as browser:
+        pages = [browser.get(path).text for path in ("/", "/cluster", f"/run/{key(folder)}")]
+    for page in pages:
+        (names,) = re.findall(r'<body data-live="([^"]+)">', page)
+        assert {"facts", "notices"} <= {*names.split()}
+        for name in names.split():
+            assert page.count(f' id="{name}"') == 1, name
+    assert "submit-rows" in names.split()
+    assert "messages" in names.split()

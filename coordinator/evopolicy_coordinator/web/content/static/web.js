@@ -1,5 +1,5 @@
 "use strict";
-// Keeps a page up to date from server-sent events, each of which holds what has changed. The server has escaped everything.
+// Keeps a page up to date: asks for it again and replaces what has changed. The server has escaped everything.
 (() => {
   // A printed address has the token behind "#", which no browser sends and no log keeps: it is handed over in a request's body.
   const form = document.getElementById("signin");
@@ -11,39 +11,23 @@
     return;
   }
   const state = document.getElementById("live");
-  const address = document.body.dataset.events;
-  if (!state || !address) return;
-  let cursor = document.body.dataset.cursor;
-  let source = null;
+  if (!state) return;
+  const PAUSE_MS = 2000;
+  const WAIT_MS = 30000;
+  const known = new Map();
+  let etag = "";
+  let asking = false;
   let timer = null;
 
-  const made = (html) => {
-    const template = document.createElement("template");
-    template.innerHTML = html;
-    return template.content.firstElementChild;
-  };
-  const take = (message) => {
-    const fresh = new Map();
-    for (const [id, html] of Object.entries(message.parts)) {
-      const old = document.getElementById(id);
-      if (old) Idiomorph.morph(old, made(html), { morphStyle: "outerHTML", ignoreActiveValue: true });
-      else fresh.set(id, html);
-    }
-    for (const [id, order] of Object.entries(message.lists)) {
-      const list = document.getElementById(id);
-      if (!list) continue;
-      const atEnd = list.scrollHeight - list.scrollTop - list.clientHeight < 40;
-      const kept = new Set(order);
-      for (const child of [...list.children]) if (!kept.has(child.id)) child.remove();
-      let place = list.firstElementChild;
-      for (const name of order) {
-        let child = document.getElementById(name);
-        if (!child && fresh.has(name)) child = made(fresh.get(name));
-        if (!child) continue;
-        if (child === place) place = place.nextElementSibling;
-        else list.insertBefore(child, place);
-      }
-      if (atEnd && list.dataset.follow !== undefined) list.scrollTop = list.scrollHeight;
+  const take = (page) => {
+    for (const id of page.body.dataset.live.split(" ")) {
+      const [old, fresh] = [document.getElementById(id), page.getElementById(id)];
+      // Compared with the server's last text, as scripts may have changed the element since.
+      if (!old || !fresh || known.get(id) === fresh.outerHTML) continue;
+      known.set(id, fresh.outerHTML);
+      const atEnd = old.scrollHeight - old.scrollTop - old.clientHeight < 40;
+      Idiomorph.morph(old, fresh, { morphStyle: "outerHTML", ignoreActiveValue: true });
+      if (atEnd && old.dataset.follow !== undefined) old.scrollTop = old.scrollHeight;
     }
   };
   const say = (name, text) => {
@@ -51,29 +35,27 @@
     state.dataset.state = name;
     state.textContent = text;
   };
-  const open = () => {
+  const ask = async () => {
+    // A page that nobody sees asks for nothing. It catches up when it is seen again.
+    if (asking || document.hidden) return;
+    asking = true;
     clearTimeout(timer);
-    if (source) source.close();
-    source = new EventSource(address + (address.includes("?") ? "&" : "?") + "since=" + encodeURIComponent(cursor));
-    source.onopen = () => say("live", "live");
-    source.addEventListener("update", (event) => {
-      cursor = event.lastEventId;
+    try {
+      const headers = etag ? { "If-None-Match": etag } : {};
+      const answer = await fetch(location.href, { headers, signal: AbortSignal.timeout(WAIT_MS) });
+      if (!answer.ok && answer.status !== 304) throw new Error(answer.statusText);
+      if (answer.ok) {
+        take(new DOMParser().parseFromString(await answer.text(), "text/html"));
+        etag = answer.headers.get("etag");
+      }
       say("live", "live");
-      take(JSON.parse(event.data));
-    });
-    source.onerror = () => {
+    } catch {
       say("away", "no connection; trying again");
-      // A browser gives up for good after some answers, such as those of a proxy whose server is away.
-      source.close();
-      clearTimeout(timer);
-      timer = setTimeout(open, 2000);
-    };
+    }
+    asking = false;
+    timer = setTimeout(ask, PAUSE_MS);
   };
-  // A page that nobody sees needs no connection: browsers allow few to one server. It catches up when it is seen again.
-  document.addEventListener("visibilitychange", () => {
-    if (document.hidden) { clearTimeout(timer); if (source) source.close(); source = null; }
-    else if (!source || source.readyState === EventSource.CLOSED) open();
-  });
+  document.addEventListener("visibilitychange", ask);
   for (const list of document.querySelectorAll("[data-follow]")) list.scrollTop = list.scrollHeight;
-  if (!document.hidden) open();
+  ask();
 })();
