@@ -22,7 +22,6 @@ from evopolicy_gateway.processes import child_messages
 from evopolicy_gateway.processes.child_messages import Orders, Progress, Ready, Waits
 from evopolicy_gateway.run.gateway import Gateway
 from evopolicy_gateway.run_folder.layout import RunFolder, folder_of
-from evopolicy_gateway.run_folder.listener import AgentPlace, place_of
 from evopolicy_gateway.run_folder.locks import alone
 from evopolicy_gateway.submits.pipeline import SubmitPipeline
 from evopolicy_gateway.submits.tickets import TicketMachine
@@ -36,16 +35,6 @@ log: structlog.stdlib.BoundLogger = structlog.get_logger()
 @app.command()
 def serve(
     run_directory: Annotated[Path, typer.Argument(help="Directory of an open run.", show_default=False)],
-    agent_host: Annotated[
-        str | None,
-        typer.Option(
-            metavar="BOOT_ID|unknown",
-            help=(
-                "Boot id of the agent's machine (its /proc/sys/kernel/random/boot_id), or"
-                " unknown; default: this machine's."
-            ),
-        ),
-    ] = None,
     controlled: Annotated[
         bool,
         typer.Option("--controlled", hidden=True, help="Speak with a parent process over stdin and stdout."),
@@ -62,10 +51,9 @@ def serve(
     setup_logging()
     with _failures_in_the_log() if controlled else fail_on_our_errors():
         folder = folder_of(run_directory)
-        place = None if agent_host is None else place_of(agent_host)
         # The command that controls a gateway holds the folder for both.
         with contextlib.nullcontext() if controlled else alone(folder.lock, folder.root):
-            closed = asyncio.run(_serve(folder, place, controlled))
+            closed = asyncio.run(_serve(folder, controlled))
     sys.stdout.flush()
     # A thread that still reads stdin, or a session that cannot be closed, must not hold up the exit. Status 0 tells
     # the parent that the coordinator has closed the run.
@@ -86,7 +74,7 @@ def _failures_in_the_log() -> Iterator[None]:
         raise SystemExit(FAILURE) from error
 
 
-async def _serve(folder: RunFolder, place: AgentPlace | None, controlled: bool) -> bool:
+async def _serve(folder: RunFolder, controlled: bool) -> bool:
     def ready(urls: Urls, pipeline: SubmitPipeline) -> None:
         variables = urls.environment() | workspace.variables(folder)
         if controlled:
@@ -115,7 +103,7 @@ async def _serve(folder: RunFolder, place: AgentPlace | None, controlled: bool) 
             print(f"waiting for {what}", file=sys.stderr, flush=True)
 
     calls: dict[str, Any] = {"on_ready": ready, "on_change": changed, "on_wait": waits}
-    gateway = Gateway(folder, **calls, alone=not controlled, place=place)
+    gateway = Gateway(folder, **calls, alone=not controlled)
     loop = asyncio.get_running_loop()
     for number in (signal.SIGTERM, signal.SIGINT):
         loop.add_signal_handler(number, gateway.tell, None)

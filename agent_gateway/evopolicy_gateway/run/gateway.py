@@ -54,14 +54,12 @@ class Gateway:
         on_change: Callable[[SubmitPipeline], None],
         on_wait: Callable[[str], None] = lambda waits_for: None,
         alone: bool,
-        place: AgentPlace | None = None,
     ) -> None:
         """`on_wait` receives the reason for waiting, other than the agent, or an empty text when the wait is over.
-        `alone`: no other process watches the agent. `place`: where the agent is, when it differs from the run's folder.
-        """
+        `alone`: no other process watches the agent."""
         self._folder = folder
         self._on_ready, self._on_change, self._on_wait = on_ready, on_change, on_wait
-        self._alone, self._place = alone, place
+        self._alone = alone
         self._stopped = asyncio.Event()
         """Set to leave the run open."""
         self.permit_s = 0.0
@@ -80,7 +78,7 @@ class Gateway:
         """Serves until `tell`; returns whether the run was closed. Raises errors that make serving impossible."""
         folder = self._folder
         own, known = _load(folder)
-        run, self._place = known.run, self._place or agent_place(folder)
+        run, place = known.run, agent_place(folder)
         if folder.closing.exists():
             self.tell(saved(folder.closing, CloseRun))
         async with contextlib.AsyncExitStack() as stack:
@@ -94,7 +92,7 @@ class Gateway:
             session = CoordinatorClient(link, run, folder.state)
             try:
                 opened = await self._unless(self._stopped.wait(), session.open())
-                if opened is None or not await self._permitted(session, self._place):
+                if opened is None or not await self._permitted(session, place):
                     return False
             except RefusedError as error:
                 if error.status not in RUN_OVER:
@@ -108,7 +106,7 @@ class Gateway:
             log.info("serving", run=run, env=opened.env.env, port=address.port)
             self._on_ready(address.urls(), pipeline)
             if not self._orders.done():
-                stack.callback(asyncio.ensure_future(session.keep_permit(self._place)).cancel)
+                stack.callback(asyncio.ensure_future(session.keep_permit(place)).cancel)
             try:
                 close = await self._watch(pipeline, http)
                 return close is not None and await self._close(pipeline, close)

@@ -88,22 +88,12 @@ def agent_host_of(agent: str, named: str | None) -> str:
         return ""
     if agent != AGENT:
         raise ConfigError("--agent-host applies only with --agent remote; a local agent is on this machine")
-    return _boot_id(named, ELSEWHERE, " when it is on no machine of the cluster")
-
-
-def place_of(named: str) -> AgentPlace:
-    """Parses `evopolicy-gateway --agent-host`: a boot id or `unknown`. Raises ConfigError for anything else."""
-    kernel = _boot_id(named, "unknown")
-    return AgentPlace() if kernel == "unknown" else AgentPlace(boot_id=kernel)
-
-
-def _boot_id(named: str, other: str, when: str = "") -> str:
-    if named != other and not _BOOT_ID.fullmatch(named):
+    if named != ELSEWHERE and not _BOOT_ID.fullmatch(named):
         raise ConfigError(
             f"--agent-host {named!r}: give the boot id of the agent's machine (there: cat"
-            f" /proc/sys/kernel/random/boot_id), or `{other}`{when}"
+            f" /proc/sys/kernel/random/boot_id), or `{ELSEWHERE}` when it is on no machine of the cluster"
         )
-    return named if named == other else named.lower()
+    return named if named == ELSEWHERE else named.lower()
 
 
 def agent_place(folder: RunFolder) -> AgentPlace:

@@ -157,16 +157,15 @@ async def test_a_gateway_stopped_before_its_agents_end_leaves_the_run_open(tmp_p
 
 
 async def test_agent_that_nobody_watches_ends_by_its_operators_word(tmp_path: Path) -> None:
-    more = {"alone": True, "place": AgentPlace(boot_id=KERNEL)}
     known = prepared(tmp_path, Double(opened(episode_budget=1)))
-    async with known as (folder, double), gateway_on(folder, double, **more) as service:
+    async with known as (folder, double), gateway_on(folder, double, alone=True) as service:
         await service.submit([1])
         await until(lambda: len(service.waits) > 1)
         assert "evopolicy finish" in service.waits[1]
         assert double.closed is None
         listener.finish(folder)
         assert await service.task
-    assert asked(double, RequestPermit)[0].boot_id == KERNEL
+    assert asked(double, RequestPermit)[0].boot_id == proc.boot_id()
 
 
 async def test_time_held_by_hidden_episodes_counts_against_no_limit(tmp_path: Path) -> None:
