@@ -134,17 +134,6 @@ class DiskUse(msgspec.Struct, frozen=True, kw_only=True):
     total: Int
 
 
-class TurnedAway(msgspec.Struct, frozen=True, kw_only=True):
-    """A worker whose registration was refused."""
-
-    worker: Word
-    """The name that it sent."""
-    host: Word
-    why: Text
-    ago_s: Number
-    """Seconds since its last attempt."""
-
-
 class StatusReply(Message, frozen=True, kw_only=True, tag="status_reply"):
     """The reply to `StatusRequest`."""
 
@@ -158,7 +147,6 @@ class StatusReply(Message, frozen=True, kw_only=True, tag="status_reply"):
     runs: Many[RunStatus]
     stalls: Many[Text] = ()
     """Items that have waited too long, with the reasons."""
-    turned_away: Many[TurnedAway] = ()
     queue: Many[QueuedJobs] = ()
     """Highest priority first."""
     disk: DiskUse | None = None

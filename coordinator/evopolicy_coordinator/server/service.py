@@ -52,7 +52,6 @@ from evopolicy_coordinator.server.core_host import CoreHost
 from evopolicy_coordinator.server.definitions import failed, undescribed
 from evopolicy_coordinator.server.reader import ServiceReader, answer_bytes, answer_to, damaged, lane_of
 from evopolicy_coordinator.server.reason_texts import message, operator_words, reason_text
-from evopolicy_coordinator.server.refused_workers import RefusedWorkers
 from evopolicy_coordinator.server.request_checks import finite_wait
 from evopolicy_coordinator.server.request_parser import Parsed, RequestParser
 from evopolicy_coordinator.storage.disk_use import sizes
@@ -103,7 +102,6 @@ class Service:
         self._loop = asyncio.get_running_loop()
         self._writer = Writer(store)
         self._claims = Claims(self._writer)
-        self._refused_workers = RefusedWorkers()
         self._pending: dict[int | str, Pending] = {}
         """By the number under which the core knows the query, oldest first; numbers are never reused."""
         self._n_requests = 0
@@ -370,7 +368,6 @@ class Service:
                 for run in reply.runs
             ),
             stalls=self._stalls(reply.stalls),
-            turned_away=self._refused_workers.recent(now),
             disk=self._disk,
             cost_s=self._status_cost_s,
             trouble=self._trouble,
@@ -382,7 +379,6 @@ class Service:
     def _refuse(self, query: IncomingQuery, error: RefusedError) -> None:
         log.info("refused", key=query.key, status=error.status, why=error.message)
         answer = Refused(status=error.status, message=error.message)
-        self._refused_workers.answered(query.key, query.payload, answer, self.host.now())
         self.host.confirmed(lambda: query.reply(answer_bytes(answer)), query.drop)
 
     def _turn_away(self, query: IncomingQuery) -> None:
@@ -470,7 +466,6 @@ class Service:
             reply = message(effect, self._reader.state)
             if isinstance(reply, operator.RunProgress):
                 reply = replace(reply, trouble=self._trouble)
-            self._refused_workers.answered(query.key, query.payload, reply, self.host.now())
             if isinstance(effect, Refuse):
                 self.host.confirmed(lambda: answer(reply), query.drop)
             else:

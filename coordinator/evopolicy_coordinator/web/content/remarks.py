@@ -19,10 +19,6 @@ def served_by(reply: StatusReply) -> str:
 def remarks(reply: StatusReply) -> Mapping[str, Iterable[str]]:
     """Whole sentences by heading; some have none."""
     workers = reply.workers
-    turned_away = (
-        f"{one.worker}{one.host and f' of {one.host}'} was turned away {duration(one.ago_s)} ago: {one.why}"
-        for one in reply.turned_away
-    )
     refused = (
         f"{one.worker} gets no work of {run}: {why}" for one in workers for run, why in one.refused.items()
     )
@@ -32,7 +28,6 @@ def remarks(reply: StatusReply) -> Mapping[str, Iterable[str]]:
     trouble = [f"{reply.trouble}; what follows is the last state"] if reply.trouble else []
     return {
         "The coordinator accepts no changes": trouble,
-        "Turned away": turned_away,
         "Abandoned runs, without a gateway for an hour": abandoned(reply.runs),
         "Workers that get no work of some runs": refused,
         "Workers that lack a sandbox tier or an environment": (
