@@ -17,7 +17,7 @@ from evopolicy_common.messages.gateway import FREE_SLOT, Permit, RunOpened, RunS
 from evopolicy_common.messages.operator import RunProgress
 from evopolicy_common.messages.worker import Message, Refused
 from evopolicy_coordinator.core.contract.effects import Refuse, Reply
-from evopolicy_coordinator.core.contract.reasons import Reason
+from evopolicy_coordinator.core.contract.reasons import REFUSALS, Reason
 from evopolicy_coordinator.core.isolation.conflicts import NO_BOOT_ID
 
 
@@ -56,54 +56,8 @@ def _agent_alive(run: str, place: str) -> str:
     )
 
 
-def _unknown_class(name: str, offered: tuple[str, ...]) -> str:
-    return f"no worker of class {name!r} can play the run; the classes are {', '.join(offered) or 'none'}"
-
-
 TEXTS: Mapping[str, str | Callable[..., str]] = {
-    "unknown_run": "unknown run {run!r}; `evopolicy status` shows those that are not finished",
-    "no_unfinished_run": "no unfinished run {run!r}; `evopolicy status` shows them",
-    "unknown_evaluation": "unknown evaluation {evaluation!r}",
-    "run_cancelled": "run {run!r} was cancelled",
-    "run_finished": "run {run!r} is finished",
-    "run_closed": "run {run!r} is closed",
-    "run_takes_no_more": "run {run!r} is closed and takes no more submits",
-    "run_exists": "run {run!r} already exists",
-    "budget_below_one": "the budget is {budget} episodes; it must be at least 1",
-    "submit_bounds": "a submit of {least} to {most} episodes; 1 ≤ minimum ≤ maximum is needed",
-    "minimum_over_budget": "a submit takes at least {least} episodes, the budget is {budget}",
-    "no_cases": "the {split} split has no cases",
-    "evaluation_without_cases": "an evaluation needs at least one case",
-    "epoch_revealed": (
-        "the cases of epoch {epoch} are public, as runs on them were published: stop the coordinator, run"
-        " `evopolicy-coordinator epoch new --state {state}`, and start it again, or name other cases with --data"
-    ),
-    "epoch_in_use": (
-        "run {run!r} is not finished and plays cases of the same epoch, which publishing would reveal; wait for"
-        " its end, or cancel it"
-    ),
-    "busy": "submit {submit} is still running; one runs at a time",
-    "key_used": "key {key!r} was used for submit {submit} with another request",
-    "no_bundle": "a submit needs a bundle, or the reason why it has none",
-    "unknown_submit": "run {run!r} has {n} submits, none of index {submit}",
-    "unknown_case": "env_instances names {case}; train cases are 0 to {last}",
-    "too_few": "{n} episodes asked for; a submit takes at least {least}",
-    "too_many": "{n} episodes asked for; a submit takes at most {most}",
-    "over_budget": "{n} episodes asked for; {remaining} of the budget remain",
-    "no_worker_yet": "the run waits for {waits_for}",
-    "may_not_start": "the run's agent may not start yet; it waits for {waits_for}",
-    "too_many_places": (
-        "the agent of run {run!r} has been on {n} kernels, which is the limit; if it is to start on another,"
-        " run `evopolicy runs agent-gone {run}` first"
-    ),
-    "name_taken": "a worker of another machine has the name {worker!r}; choose another --name",
-    "no_room": (
-        "{n:,} workers, with {size:,} bytes of environments, may join with one token: stop some, wait an hour for lost"
-        " ones to be forgotten, or give other machines a folder of their own (`evopolicy-coordinator certs issue worker"
-        " NAME`)"
-    ),
-    "unknown_session": "the session of worker {worker!r} is unknown; register again",
-    "unknown_class": _unknown_class,
+    **{code: text for code, (_, text) in REFUSALS.items()},
     "workers": _workers,
     "description": "a connected worker to describe {env}, as it does before its first episode",
     "scoring": "hidden cases of another run to be scored",

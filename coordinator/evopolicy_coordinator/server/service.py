@@ -327,7 +327,7 @@ class Service:
             run = core.state.runs.get(parsed.asker)
             if run is None or run.state.phase != "open":
                 reason = core.over(parsed.asker)
-                raise RefusedError(REFUSALS[reason.code], reason_text(reason))
+                raise RefusedError(REFUSALS[reason.code][0], reason_text(reason))
             run_id, submitted = run.id, frozenset(row.bundle for row in run.submits)
         answer = answer_to(query, parsed.asker)
         self._reader.put(f"{parsed.subtree}/{parsed.asker}", run_id, message, most, answer, submitted)

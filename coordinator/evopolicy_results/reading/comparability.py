@@ -1,11 +1,11 @@
 """Settings that must agree within one comparison: budgets, policy scopes, splits, fingerprints, the agents'
 confinement, and whether hidden episodes and agents shared a kernel.
 
-Settings of `_BY_SUITE` must agree over all runs of a suite, those of `_BY_ENTRY` over the runs of one entry, and those
-of `_BY_ENVIRONMENT` and the library fingerprint over the runs of one environment, since environments differ in them
-anyway. Runs with hidden cases of their own differ in these splits by design. Of a fingerprint's `adapter`
-(`REVISION+DIGEST`) the revision counts; the digest, and that of all of the worker's code, only distinguish workers
-within a run.
+Settings of `_BY_SUITE`, among them each field of `AllConditions`, must agree over all runs of a suite, those of
+`_BY_ENTRY` over the runs of one entry, and those of `_BY_ENVIRONMENT` and the library fingerprint over the runs of one
+environment, since environments differ in them anyway. Runs with hidden cases of their own differ in these splits by
+design. Of a fingerprint's `adapter` (`REVISION+DIGEST`) the revision counts; the digest, and that of all of the
+worker's code, only distinguish workers within a run.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ import msgspec
 from evopolicy_common import catalogue
 from evopolicy_common.errors import EvopolicyError
 from evopolicy_common.messages.environment import Split
+from evopolicy_common.messages.run_settings import AllConditions
 from evopolicy_common.records.run_record import inputs_digest
 from evopolicy_common.terminal import counted
 from evopolicy_results.reading.environments import grouped, ordered_environments, suites_of
@@ -129,21 +130,27 @@ def _limits(holder: Any) -> str:
     return " ".join(f"{name}={value}" for name, value in given.items() if value is not None)
 
 
+_WORDS = {
+    "observations": "observation form",
+    "simulation": "simulation rule",
+    "finish": "finish rule",
+    "feedback": "feedback detail",
+}
+"""Names of conditions in messages, where they differ from the field's."""
+_OPTIONS = {"hidden_evaluation": "profile"}
+"""Options that decide a condition, where they differ from the field's name."""
+_IN_ENVIRONMENT = ("video", "step_limit")
 _BY_SUITE = {
     "episode budget": _dimension("episode_budget", "budget"),
-    "policy scope": _dimension("policy_scope", "policy-scope"),
-    "observation form": _dimension("observations", "observations"),
-    "simulation rule": _dimension("simulation", "simulation"),
-    "finish rule": _dimension("finish", "finish"),
-    "feedback detail": _dimension("feedback", "feedback"),
+    **{
+        _WORDS.get(name, name.replace("_", " ")): _dimension(name, _OPTIONS.get(name, name.replace("_", "-")))
+        for name in AllConditions.__struct_fields__
+        if name not in _IN_ENVIRONMENT
+    },
     "text of AGENTS.md": _Setting(
         lambda run: _short(run.record.experiment_dimensions.agents_md) or "standard", "the same agents_md"
     ),
-    "failed episodes": _dimension("failed_episodes", "failed-episodes"),
-    "hidden evaluation": _dimension("hidden_evaluation", "profile"),
-    "profile": _dimension("profile", "profile"),
     "jail": _Setting(lambda run: run.record.line.jail, "the same --jail"),
-    "hidden cases": _dimension("hidden_cases", "hidden-cases"),
     "hidden isolation": _Setting(
         lambda run: run.record.hidden_isolation, concerns=lambda run: run.record.hidden_isolation != "unknown"
     ),

@@ -297,6 +297,7 @@ def test_runs_that_are_no_fair_comparison_are_refused(tmp_path: Path, change: di
         ({"limits": {"cpu_s": 1.0}}, "policy limits"),
         ({"video": "all"}, "videos in feedback"),
         ({"feedback": "scores"}, "feedback detail"),
+        ({"hidden_evaluation": "pool"}, "hidden evaluation"),
         ({"agents_md": "sha256:" + "a" * 64}, "text of AGENTS.md"),
     ],
 )

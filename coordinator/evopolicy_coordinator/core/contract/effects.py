@@ -45,7 +45,7 @@ class Refuse(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def status(self) -> Refusal:
-        return REFUSALS[self.reason.code]
+        return REFUSALS[self.reason.code][0]
 
 
 class ReadResults(msgspec.Struct, frozen=True, kw_only=True):

@@ -136,7 +136,9 @@ def repinned(state: State, event: events.Requested[operator.RepinRun], step: Ste
     offered = {_class_of_worker(state, each): each for each in able}
     offered |= {each.classes[run.flow.env]: each for each in able}
     if message.fingerprint_class not in offered:
-        raise NotDoneError("unknown_class", name=message.fingerprint_class, offered=tuple(offered))
+        raise NotDoneError(
+            "unknown_class", name=message.fingerprint_class, offered=", ".join(offered) or "none"
+        )
     profile = offered[message.fingerprint_class]
     name = profile.classes[run.flow.env]
     text = f"{run.state.fingerprint_class} → {name}: {message.reason}"

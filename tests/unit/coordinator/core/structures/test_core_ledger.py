@@ -71,4 +71,4 @@ def test_a_request_is_refused_exactly_when_it_breaks_a_bound(ids: list[int], ava
     fits = 2 <= len(ids) <= min(8, available)
     assert (refused is None) == (inside and fits)
     if refused is not None:
-        assert REFUSALS[refused.code] == ("budget_invalid" if inside else "invalid_env_instance")
+        assert REFUSALS[refused.code][0] == ("budget_invalid" if inside else "invalid_env_instance")
