@@ -22,7 +22,6 @@ from typing import Any
 sys.path.insert(0, str(Path(__file__).parent))
 sys.path.insert(1, str(Path(__file__).parents[1] / "support"))
 
-import msgspec
 from rigs.asking import asked
 
 from evopolicy_common.messages import gateway, operator
@@ -30,6 +29,8 @@ from evopolicy_common.messages import worker as wire
 from evopolicy_common.messages.environment import Case, EnvironmentDescription
 from evopolicy_common.messages.episode import EpisodeOutcome
 from evopolicy_common.messages.run_settings import RunSettings
+from evopolicy_common.messages.status import folded
+from evopolicy_common.wire import codec
 from evopolicy_coordinator.core.contract.effects import Effect, ReadResults, Reply
 from evopolicy_coordinator.core.contract.records import Snapshot
 from evopolicy_coordinator.core.contract.settings import CoreSettings
@@ -233,7 +234,7 @@ class Load:
     def status(self) -> tuple[float, int]:
         """CPU time of an operator's status, and its size as a message."""
         began = time.process_time()
-        size = len(msgspec.msgpack.encode(self.core.status(self.now, reason_text)))
+        size = len(codec.encode(folded(self.core.status(self.now, reason_text))))
         return time.process_time() - began, size
 
 

@@ -24,7 +24,7 @@ from evopolicy_common.messages.environment import EnvironmentDescription
 from evopolicy_common.messages.episode import BlobRef, EpisodeOutcome, EpisodeSpec, Job
 from evopolicy_common.messages.operator import RunFinished
 from evopolicy_common.messages.run_settings import RunSettings
-from evopolicy_common.messages.status import StatusReply, StatusRequest
+from evopolicy_common.messages.status import StatusReply, StatusRequest, unfolded
 from evopolicy_common.records.policies import bundles
 from evopolicy_common.records.policies.bundles import Bundle, BundleFile
 from evopolicy_common.refusals import Refusal
@@ -321,7 +321,7 @@ class OperatorClient:
                 return outcomes
 
     async def status(self) -> StatusReply:
-        return await self.ask.until_answered("status", StatusRequest(token=self.token), StatusReply)
+        return unfolded(await self.ask.until_answered("status", StatusRequest(token=self.token), StatusReply))
 
 
 @contextlib.asynccontextmanager

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Literal
 
 import msgspec
+from msgspec.structs import replace
 
 from evopolicy_common.messages.bounds import Int, Many, Named, Number, Text, Word
 from evopolicy_common.messages.episode import Tier
@@ -57,6 +58,13 @@ class WorkerStatus(msgspec.Struct, frozen=True, kw_only=True):
     """Sandbox tiers that should work there and do not, with the reasons."""
     failed_environments: Named[Text] = {}
     """Environments that it should offer and that could not be described or failed their try-out, with the reasons."""
+    like: Word = ""
+    """In a message: the worker that has the fields `_SHARED` in place of this one."""
+
+
+_SHARED = ("tiers", "environments", "fingerprint", "versions", "refused", "classes")
+"""What workers of one installation have in common: most of a status, if there are thousands."""
+_LEFT_OUT = {"tiers": (), "environments": (), "fingerprint": "", "versions": {}, "refused": {}, "classes": {}}
 
 
 class RetriedJobs(msgspec.Struct, frozen=True, kw_only=True):
@@ -161,3 +169,23 @@ class StatusReply(Message, frozen=True, kw_only=True, tag="status_reply"):
     """How long the database took to confirm the lead; None where the rows are in a file."""
     standbys: Many[Word] = ()
     """The machines whose coordinators wait for the lead."""
+
+
+def folded(reply: StatusReply) -> StatusReply:
+    """The reply as it is sent, in which alike workers name the first of them. `unfolded` is the reverse."""
+    firsts: dict[tuple[object, ...], WorkerStatus] = {}
+    workers = []
+    for worker in reply.workers:
+        first = firsts.setdefault((worker.fingerprint, worker.tiers, worker.environments), worker)
+        alike = first is not worker and all(getattr(first, each) == getattr(worker, each) for each in _SHARED)
+        workers.append(replace(worker, like=first.worker, **_LEFT_OUT) if alike else worker)
+    return replace(reply, workers=tuple(workers))
+
+
+def unfolded(reply: StatusReply) -> StatusReply:
+    known = {worker.worker: {each: getattr(worker, each) for each in _SHARED} for worker in reply.workers}
+    workers = tuple(
+        replace(worker, like="", **known[worker.like]) if worker.like in known else worker
+        for worker in reply.workers
+    )
+    return replace(reply, workers=workers)

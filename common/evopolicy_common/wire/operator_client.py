@@ -14,7 +14,7 @@ from evopolicy_common.errors import BrokenEnvironmentError, EvopolicyError, Refu
 from evopolicy_common.messages import operator as ops
 from evopolicy_common.messages.environment import Split
 from evopolicy_common.messages.episode import BlobRef, EpisodeOutcome
-from evopolicy_common.messages.status import FromOperator, StatusReply, StatusRequest
+from evopolicy_common.messages.status import FromOperator, StatusReply, StatusRequest, unfolded
 from evopolicy_common.refusals import Refusal
 from evopolicy_common.wire.requests import Wanted, operator_requests
 from evopolicy_common.wire.transport import Link
@@ -47,7 +47,7 @@ class OperatorClient:
 
     async def status(self, max_age_s: float = 0.0) -> StatusReply:
         """The cluster's status, made at most `max_age_s` seconds ago."""
-        return await self._ask("status", StatusRequest(max_age_s=max_age_s), StatusReply)
+        return unfolded(await self._ask("status", StatusRequest(max_age_s=max_age_s), StatusReply))
 
     async def environments(
         self,

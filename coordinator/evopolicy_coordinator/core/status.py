@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable
+from typing import Any
 
 from evopolicy_common.messages.status import QueuedJobs, RunStatus, StatusReply, WorkerStatus
 from evopolicy_coordinator.core.agents import permits
@@ -20,6 +21,7 @@ from evopolicy_coordinator.core.tables.model import (
     RANKS,
     JobGroup,
     JobState,
+    Profile,
     Run,
     Worker,
 )
@@ -33,17 +35,15 @@ def status(state: State, now: float, words: Words) -> StatusReply:
     """Returns a reply with the core's fields; the shell adds its own. `words` puts a reason into words."""
     # Computed once per profile and once per run: thousands of workers have few profiles, and hundreds of runs
     # share the groups.
-    refused = {
-        profile: pins.refused_runs(state, profile)
-        for profile in {worker.profile: None for worker in state.workers.values()}
-    }
+    profiles = {worker.profile: None for worker in state.workers.values()}
+    shared = {profile: _shared(state, profile) for profile in profiles}
     groups: dict[str, list[JobGroup]] = {}
     waits: dict[JobGroup, Reason] = {}
     for group in state.groups.values():
         groups.setdefault(group.run, []).append(group)
         if (reason := waits_for(state, group)) is not None:
             waits[group] = reason
-    workers = tuple(_worker(state, worker, now, refused[worker.profile]) for worker in state.workers.values())
+    workers = tuple(_worker(state, worker, now, shared[worker.profile]) for worker in state.workers.values())
     runs = tuple(_run(state, run, groups.get(run.id, []), waits, words) for run in state.runs.values())
     return StatusReply(
         cluster="",
@@ -82,29 +82,34 @@ def _queue(state: State, waits: dict[JobGroup, Reason], words: Words) -> tuple[Q
     return tuple(queue)
 
 
-def _worker(state: State, worker: Worker, now: float, refused: dict[str, str]) -> WorkerStatus:
-    profile = worker.profile
+def _shared(state: State, profile: Profile) -> dict[str, Any]:
+    return {
+        "tiers": tuple(sorted(profile.key[1])),
+        "environments": tuple(sorted(profile.descriptions)),
+        "fingerprint": profile.fingerprint.class_name(cpu=state.settings.fingerprint_cpu),
+        "versions": {**profile.fingerprint.versions(), "cpu": profile.fingerprint.cpu},
+        "classes": profile.classes,
+        "refused": pins.refused_runs(state, profile),
+    }
+
+
+def _worker(state: State, worker: Worker, now: float, shared: dict[str, Any]) -> WorkerStatus:
     live = [lease for lease in worker.leases.values() if lease.live]
     return WorkerStatus(
         worker=worker.name,
         host=worker.host,
         slots=worker.slots,
         state=worker.state,
-        tiers=tuple(sorted(profile.key[1])),
-        environments=tuple(sorted(profile.descriptions)),
-        fingerprint=profile.fingerprint.class_name(cpu=state.settings.fingerprint_cpu),
-        versions={**profile.fingerprint.versions(), "cpu": profile.fingerprint.cpu},
-        classes=profile.classes,
         held=len(live),
         running=sum(lease.running for lease in live),
         last_seen_s=max(0.0, now - worker.last_seen),
-        refused=refused,
         boot_id=worker.kernel.boot_id,
         hidden_bar=conflicts.conflict_of_worker(state, worker),
         playing=dict(Counter(lease.job.group.run for lease in live if lease.running)),
         installation=worker.installation,
         missing_tiers=worker.missing_tiers,
         failed_environments=worker.failed_environments,
+        **shared,
     )
 
 

@@ -34,7 +34,7 @@ from evopolicy_common.errors import (
 )
 from evopolicy_common.logs import structlog
 from evopolicy_common.messages import operator
-from evopolicy_common.messages.status import DiskUse, StatusReply, StatusRequest
+from evopolicy_common.messages.status import DiskUse, StatusReply, StatusRequest, folded
 from evopolicy_common.messages.worker import BlobGet, BlobPut, LeaseRequest, Message, Refused
 from evopolicy_common.records.policies import bundles
 from evopolicy_common.refusals import Refusal
@@ -348,7 +348,7 @@ class Service:
         """The status as a message; the last one again if it is young enough, as each visits all state."""
         if self._last_status is None or self.host.now() - self._last_status[0] >= max_age_s:
             began = time.thread_time()
-            self._last_status = self.host.now(), answer_bytes(self._status(core))
+            self._last_status = self.host.now(), answer_bytes(folded(self._status(core)))
             self._status_cost_s = time.thread_time() - began
         return self._last_status[1]
 
@@ -402,7 +402,7 @@ class Service:
             return
         run = core.state.runs.get(message.run) if isinstance(message, operator.WaitRun) else None
         if isinstance(message, StatusRequest):
-            query.reply(answer_bytes(self._status(core)))
+            query.reply(answer_bytes(folded(self._status(core))))
         elif isinstance(message, operator.WaitRun) and run is not None:
             progress, _ = finished.progress(core.state, run)
             answer = answer_bytes(replace(progress, trouble=self._trouble))

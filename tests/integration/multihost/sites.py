@@ -27,7 +27,7 @@ from coordinator_harness import OperatorClient
 from machines.hosts import Host, Network
 
 from evopolicy_common.errors import TransportError
-from evopolicy_common.messages.status import StatusReply, StatusRequest
+from evopolicy_common.messages.status import StatusReply, StatusRequest, unfolded
 from evopolicy_common.wire import credentials
 from evopolicy_common.wire.transport import connect
 
@@ -199,7 +199,7 @@ class Sites:
                 message = StatusRequest(token=client.token)
                 while time.monotonic() < deadline:
                     with contextlib.suppress(TransportError):
-                        reply = await client.ask.once("status", message, StatusReply)
+                        reply = unfolded(await client.ask.once("status", message, StatusReply))
                         if fits(reply):
                             return reply
                     assert process is None or process.poll() is None, "it ended before"
