@@ -4,7 +4,10 @@ A job's cost is the CPU time of the core and nothing else: the workers here answ
 It must stay flat, and memory must not grow with finished jobs: it is measured in a second pass, after two fifths of
 them (when the core's trace, of fixed size, is full) and at the end.
 
-    python tests/simulation/scale.py [--jobs 1000000] [--workers 10,100,1000,2000] [--slots 2] [--runs N] [--no-memory]
+    python tests/simulation/scale.py [--jobs 1000000] [--workers 10,100,1000,2000] [--slots 2] [--runs N]
+        [--episode-s 60] [--no-memory]
+
+`core s/s` is the core's CPU time for a simulated second: at 1 it cannot serve more.
 """
 
 from __future__ import annotations
@@ -38,21 +41,29 @@ from evopolicy_coordinator.core.machine import Core
 from evopolicy_coordinator.server.reason_texts import reason_text
 
 ENVS = tuple(f"toy/env{index}" for index in range(16))
+DESCRIPTIONS = tuple(
+    EnvironmentDescription(
+        env=env, env_version="1", obs_space={}, action_space={}, max_episode_steps=9, task_text=""
+    )
+    for env in ENVS
+)
 EPISODES = 128
 """In a submit."""
 SUBMITS = 4
 """In a run; then it is validated and scored, and another run starts."""
-EPISODE_S = 2.0
-"""Simulated; long enough that leases are granted one by one, the most expensive case."""
 BEAT_S = 2.0
+START = 1000.0
 
 
 class Load:
     """A core under load: workers poll, send heartbeats and report, and gateways submit again as soon as they may."""
 
-    def __init__(self, workers: int, jobs: int, slots: int, runs: int, *, memory: bool) -> None:
-        """`runs` at once; 0: twice as many as keep all slots busy."""
-        self.now = 1000.0
+    def __init__(
+        self, workers: int, jobs: int, slots: int, runs: int, episode_s: float, *, memory: bool
+    ) -> None:
+        """`runs` at once; 0: twice as many as keep all slots busy. `episode_s`: simulated; from a second on leases are
+        granted one by one, the most expensive case."""
+        self.now = START
         self.core, _ = Core.load(CoreSettings(), Snapshot(incarnation=1), self.now)
         self.jobs, self.done, self.handled = jobs, 0, 0
         self.cpu_s = self.longest_s = 0.0
@@ -66,7 +77,7 @@ class Load:
         self._polls: dict[int, int] = {}
         self._ready: deque[tuple[int, tuple[wire.Lease, ...]]] = deque()
         self._accepted: dict[int, int] = {}
-        self._slots = slots
+        self._slots, self._episode_s = slots, episode_s
         self._runs = runs or max(2, min(2 * workers * slots // EPISODES + 16, jobs // EPISODES))
         self._created = 0
         self._submitted: dict[str, int] = {}
@@ -100,17 +111,22 @@ class Load:
 
     # ---- clients ----
 
-    def start(self) -> None:
-        descriptions = tuple(
-            EnvironmentDescription(
-                env=env, env_version="1", obs_space={}, action_space={}, max_episode_steps=9, task_text=""
-            )
-            for env in ENVS
-        )
+    def register(self) -> float:
+        """All workers join; returns the CPU time."""
+        before = self.cpu_s
         fingerprint = wire.Fingerprint(code_version="1", python="3", packages={}, cpu="")
         for index, name in enumerate(self._names):
-            offered = {"tiers": ("bwrap",), "environments": descriptions, "fingerprint": fingerprint}
-            self._ask_as(index, wire.Register, slots=self._slots, boot_id=f"kernel-of-{name}", **offered)
+            offered = {"tiers": ("bwrap",), "environments": DESCRIPTIONS, "undescribed": ("toy/rare",)}
+            itself = {
+                "boot_id": f"kernel-of-{name}",
+                "machine": f"machine-of-{name}",
+                "fingerprint": fingerprint,
+            }
+            self._ask_as(index, wire.Register, slots=self._slots, **itself, **offered)
+        return self.cpu_s - before
+
+    def start(self) -> None:
+        self.register()
         for _ in range(self._runs):
             self._create()
         for index in range(len(self._names)):
@@ -167,7 +183,7 @@ class Load:
             "length": 1,
             "terminated": True,
             "truncated": False,
-            "wall_s": EPISODE_S,
+            "wall_s": self._episode_s,
         }
         outcomes = tuple(EpisodeOutcome(index=spec.index, **ended) for spec in lease.job.episodes)
         named = {"lease_id": lease.lease_id, "job_id": lease.job.job_id, "attempt": lease.attempt}
@@ -206,7 +222,7 @@ class Load:
                         lease_id=lease.lease_id, job_id=lease.job.job_id, attempt=lease.attempt, running=True
                     )
                     self._held[worker][lease.lease_id] = held
-                    playing.append((self.now + EPISODE_S, worker, lease))
+                    playing.append((self.now + self._episode_s, worker, lease))
                 self._poll(worker)
             while next_beat <= self.now:
                 self._beat(beating)
@@ -231,6 +247,9 @@ class Load:
         if self._measure:
             tracemalloc.stop()
 
+    def simulated_s(self) -> float:
+        return self.now - START
+
     def status(self) -> tuple[float, int]:
         """CPU time of an operator's status, and its size as a message."""
         began = time.process_time()
@@ -244,16 +263,18 @@ def main() -> int:
     parser.add_argument("--workers", default="10,100,1000,2000", help="fleets to try (10,100,1000,2000)")
     parser.add_argument("--slots", type=int, default=2, help="of each worker (2)")
     parser.add_argument("--runs", type=int, default=0, help="at once (twice as many as keep all slots busy)")
+    parser.add_argument("--episode-s", type=float, default=2.0, help="simulated seconds of an episode (2)")
     parser.add_argument("--no-memory", action="store_true", help="leave out the pass that traces memory")
     options = parser.parse_args()
     print(
-        "workers    jobs  core µs/job  events/job  longest event ms  status ms      KiB  memory early KiB  late KiB"
+        "workers    jobs  core µs/job  events/job  core s/s  longest event ms  status ms      KiB  all rejoin ms"
+        "  memory early KiB  late KiB"
     )
     costs = []
     for workers in [int(each) for each in options.workers.split(",")]:
         # CPU time in one pass, memory in another, since tracing memory is slow.
         passes = [
-            Load(workers, options.jobs, options.slots, options.runs, memory=memory)
+            Load(workers, options.jobs, options.slots, options.runs, options.episode_s, memory=memory)
             for memory in (False, True)[: 1 if options.no_memory else 2]
         ]
         for each in passes:
@@ -263,10 +284,13 @@ def main() -> int:
         load = passes[0]
         costs.append(1e6 * load.cpu_s / load.done)
         status_s, status_bytes = load.status()
+        rejoin_s = load.register()
         early, late = (size / 1024 for size in passes[-1].memory or (0, 0))
         print(
             f"{workers:7d} {load.done:7d} {costs[-1]:12.1f} {load.handled / load.done:11.2f} "
-            f"{1e3 * load.longest_s:17.2f} {1e3 * status_s:10.0f} {status_bytes / 1024:8.0f} {early:17.0f} {late:9.0f}",
+            f"{load.cpu_s / load.simulated_s():9.3f} {1e3 * load.longest_s:17.2f} "
+            f"{1e3 * status_s:10.0f} {status_bytes / 1024:8.0f} "
+            f"{1e3 * rejoin_s:14.0f} {early:17.0f} {late:9.0f}",
             flush=True,
         )
     peak_mib = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024

@@ -18,6 +18,9 @@ Rules that this module owns:
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from functools import partial
+
 from evopolicy_coordinator.core.contract.records import submit_group
 from evopolicy_coordinator.core.isolation import conflicts
 from evopolicy_coordinator.core.isolation.conflicts import all_related
@@ -54,33 +57,29 @@ def check_due(state: State, key: LaneKey, step: Step) -> None:
         return
     passed_s = min(step.now - lane.checked_at, 2 * CHECK_S)
     lane.checked_at = step.now
-    at_work = _at_work(state, lane, step.now)
     for reservation in list(lane.reservations.values()):
         if not any(flow.n_hidden and flow.lane is lane for flow in reservation.flows):
             _release(state, reservation, step, "its hidden cases are played")
-        elif reservation.kernel not in at_work:
+        elif reservation.kernel not in _at_work(state, lane, step.now):
             _release(state, reservation, step, "no worker is left that plays them")
     for case_set in [each for each in lane.waiting[HIDDEN] if each is not None]:
-        if at_work and all(conflicts.hidden_conflict(state, case_set, kernel) for kernel in at_work):
-            _kept(state, lane, case_set, at_work, passed_s, step)
+        at_work = partial(_at_work, state, lane, step.now)
+        if any(at_work()) and all(conflicts.hidden_conflict(state, case_set, each) for each in at_work()):
+            _kept(state, lane, case_set, passed_s, step)
     _train(state, lane, step)
     watch(state, lane, step)
 
 
-def _at_work(state: State, lane: Lane, now: float) -> list[Kernel]:
+def _at_work(state: State, lane: Lane, now: float) -> Iterator[Kernel]:
     """The known kernels with an active worker that may serve the lane, and plays or has just polled. One that never
-    polls may be stuck, or its kernel made up."""
-    there: dict[Kernel, None] = {}
+    polls may be stuck, or its kernel made up. One by one: the first free one of thousands decides."""
     for worker in (state.workers[name] for profile in lane.profiles for name in profile.workers):
         asked = worker.polled_at is not None and now - worker.polled_at <= state.settings.lease_ttl_s
         if worker.kernel is not state.everywhere and (worker.poll or worker.n_live or asked):
-            there[worker.kernel] = None
-    return list(there)
+            yield worker.kernel
 
 
-def _kept(
-    state: State, lane: Lane, case_set: CaseSet, there: list[Kernel], passed_s: float, step: Step
-) -> None:
+def _kept(state: State, lane: Lane, case_set: CaseSet, passed_s: float, step: Step) -> None:
     """Count the wait of a case set's hidden jobs, which are kept from all kernels; reserve one for those that have
     waited for long."""
     waiting: dict[Flow, None] = {flow: None for _, _, flow in lane.heaps[HIDDEN] if flow.n_ready[HIDDEN]}
@@ -96,7 +95,7 @@ def _kept(
         reservation.flows.update(long)
         _end_overdue(state, reservation, step)
     elif long:
-        _reserve(state, lane, case_set, there, long, step)
+        _reserve(state, lane, case_set, long, step)
 
 
 def _end_overdue(state: State, reservation: Reservation, step: Step) -> None:
@@ -107,13 +106,11 @@ def _end_overdue(state: State, reservation: Reservation, step: Step) -> None:
                 step.tell(AgentOverdue(state.runs[row.run]))
 
 
-def _reserve(
-    state: State, lane: Lane, case_set: CaseSet, there: list[Kernel], flows: dict[Flow, None], step: Step
-) -> None:
+def _reserve(state: State, lane: Lane, case_set: CaseSet, flows: dict[Flow, None], step: Step) -> None:
     def in_the_way(kernel: Kernel) -> tuple[int, int]:
         return len(all_related(kernel.permits, case_set)), len(all_related(kernel.train, case_set))
 
-    kernel = min(there, key=in_the_way)
+    kernel = min(_at_work(state, lane, step.now), key=in_the_way)
     reservation = lane.reservations[case_set] = Reservation(kernel, lane, case_set, flows)
     case_set.users += 1
     conflicts.put(kernel.reservations, case_set, str(lane.key), reservation)
@@ -134,11 +131,10 @@ def _release(state: State, reservation: Reservation, step: Step, why: str) -> No
 
 def _train(state: State, lane: Lane, step: Step) -> None:
     """Start or stop counting the time for which submits are held."""
-    there = conflicts.serving(state, lane)
     barred = {
         case_set
-        for case_set in lane.waiting[TRAIN]
-        if there and all(conflicts.train_conflict(state, case_set, kernel) for kernel in there)
+        for case_set in (lane.waiting[TRAIN] if lane.slots() else ())
+        if all(conflicts.train_conflict(state, case_set, each) for each in conflicts.serving(state, lane))
     }
     for group in [group for group in state.held if group.flow.lane is lane]:
         if group.flow.case_set not in barred:

@@ -12,7 +12,7 @@ Rules that this module owns:
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from typing import TypeVar
 
 from evopolicy_coordinator.core.contract.reasons import Reason, because
@@ -47,10 +47,10 @@ def tidy(state: State, kernel: Kernel) -> None:
         state.kernels.pop(kernel.boot_id, None)
 
 
-def serving(state: State, lane: Lane) -> dict[Kernel, None]:
-    """The kernels of the active workers that may serve a lane."""
+def serving(state: State, lane: Lane) -> Iterator[Kernel]:
+    """The kernels of the active workers that may serve a lane, one by one as in `precedence._at_work`."""
     workers = state.workers
-    return {workers[name].kernel: None for profile in lane.profiles for name in profile.workers}
+    return (workers[name].kernel for profile in lane.profiles for name in profile.workers)
 
 
 def freed(state: State, case_set: CaseSet | None, step: Step, *, train_too: bool = True) -> None:
@@ -223,19 +223,18 @@ def obstacle(state: State, group: JobGroup) -> Reason | None:
     For a train group the only such reason is hidden jobs.
     """
     lane, case_set = group.flow.lane, group.flow.case_set
-    if lane is None or not state.isolates or not (group.hidden or group.kind == "train"):
-        return None
-    there = serving(state, lane)
-    if not there:
+    if lane is None or not state.isolates or not (group.hidden or group.kind == "train") or not lane.slots():
         return None
     if group.kind == "train":
-        return (
-            because("scoring") if all(train_conflict(state, case_set, kernel) for kernel in there) else None
-        )
-    why = [hidden_conflict(state, case_set, kernel) for kernel in there]
-    if not all(why):
-        return None
-    for kernel in there:
+        barred = all(train_conflict(state, case_set, kernel) for kernel in serving(state, lane))
+        return because("scoring") if barred else None
+    why: set[str] = set()
+    for kernel in serving(state, lane):
+        reason = hidden_conflict(state, case_set, kernel)
+        if reason is None:
+            return None
+        why.add(reason)
+    for kernel in serving(state, lane):
         permits = permits_there(state, kernel, case_set)
         if permits is not None:
             row = next(iter(permits.values()))

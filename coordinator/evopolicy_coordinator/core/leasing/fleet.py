@@ -45,11 +45,8 @@ def of_session(state: State, name: str, session: str, now: float) -> Worker | No
 
 def has_room(state: State, event: WorkerRegistered) -> bool:
     """Whether another worker may join with the token of this one."""
-    others = [
-        each
-        for each in state.workers.values()
-        if each.machine == event.machine and each.name != event.message.worker
-    ]
+    there = state.machines.get(event.machine, {})
+    others = [each for name, each in there.items() if name != event.message.worker]
     size = event.size + _told_size(event.message)
     size += sum(profile.size for profile in {each.profile for each in others})
     size += sum(each.told_size for each in others)
@@ -91,13 +88,15 @@ def register(state: State, event: WorkerRegistered, kernel: Kernel, step: Step) 
         for lease in worker.leases.values():
             lease.orphan_until = step.now + state.settings.adoption_s
         state.sessions.pop(old.session, None)
+        pop_entry(state.machines, old.machine, old.name)
     for env in (*(each.env for each in message.environments), *message.failed_environments):
         state.awaited.pop(env, None)
     state.workers[message.worker] = worker
+    state.machines.setdefault(worker.machine, {})[worker.name] = worker
     state.sessions[worker.session] = worker.name
     count_in(state, worker)
     if old is not None and old.profile is not profile:
-        _drop_profiles(state)
+        _drop_unused(state, old.profile)
     if worker.benched_until > step.now:
         state.timers.arm(("bench", worker.name), worker.benched_until)
     state.timers.arm(("worker", worker.name), step.now + state.settings.adoption_s)
@@ -118,12 +117,10 @@ def _profile(state: State, event: WorkerRegistered) -> Profile:
     return profile
 
 
-def _drop_profiles(state: State) -> None:
-    """Forget profiles that no worker has. A worker may come with another one each time."""
-    used = {worker.profile for worker in state.workers.values()}
-    for profile in list(state.profiles.values()):
-        if profile not in used:
-            queue.drop_profile(state, profile)
+def _drop_unused(state: State, profile: Profile) -> None:
+    """Forget a profile if no worker has it. A worker may come with another one each time."""
+    if all(worker.profile is not profile for worker in state.workers.values()):
+        queue.drop_profile(state, profile)
 
 
 def count_in(state: State, worker: Worker) -> None:
@@ -164,7 +161,8 @@ def forget(state: State, worker: Worker) -> None:
     """Remove a worker that was lost long ago."""
     del state.workers[worker.name]
     state.sessions.pop(worker.session, None)
-    _drop_profiles(state)
+    pop_entry(state.machines, worker.machine, worker.name)
+    _drop_unused(state, worker.profile)
 
 
 def answer_beat(state: State, worker: Worker, stop: tuple[str, ...], step: Step) -> None:
@@ -183,8 +181,7 @@ def _wanted(state: State, worker: Worker) -> tuple[str, ...]:
         return ()
     waiting = [*state.awaited, *(flow.env for flow in state.unpinned.values())]
     # Pinned before a restart of its workers, which describe anew what their caches have lost.
-    flows = [each.flow for each in state.runs.values()] + [each.flow for each in state.evaluations.values()]
-    waiting += [flow.env for flow in flows if flow.lane is not None and not flow.lane.workers()]
+    waiting += [lane.key[0] for lane in state.lanes.values() if lane.n_flows and not lane.workers()]
     return tuple(sorted(worker.undescribed.intersection(waiting)))
 
 

@@ -26,7 +26,9 @@ def add_flow(state: State, flow: Flow) -> None:
 def drop_flow(state: State, flow: Flow) -> None:
     """Remove the flow of a finished run or evaluation, which has no waiting jobs."""
     state.unpinned.pop(flow.id, None)
-    flow.lane = None
+    if flow.lane is not None:
+        flow.lane.n_flows -= 1
+        flow.lane = None
     state.case_sets.leave(flow.case_set)
 
 

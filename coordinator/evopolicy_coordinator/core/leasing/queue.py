@@ -74,6 +74,7 @@ def place(state: State, flow: Flow, pin: str) -> Lane:
             old.n_ready[priority] -= flow.n_ready[priority]
             old.count(priority, flow, -flow.n_ready[priority] - suspects.count(priority))
         _settle(old)
+        old.n_flows -= 1
     key = (flow.env, flow.tier, pin)
     lane = state.lanes.get(key)
     if lane is None:
@@ -81,6 +82,7 @@ def place(state: State, flow: Flow, pin: str) -> Lane:
         for profile in state.profiles.values():
             _join(profile, lane)
     flow.pin, flow.lane = pin, lane
+    lane.n_flows += 1
     if flow.case_set is not None:
         flow.case_set.lanes[lane] = None
     for priority in range(N_PRIORITIES):

@@ -383,6 +383,7 @@ class Lane:
     """Flows that the same workers can serve."""
 
     key: LaneKey
+    n_flows: int = 0
     heaps: list[list[tuple[float, int, Flow]]] = field(default_factory=partial(by_priority, list))
     n_ready: list[int] = field(default_factory=partial(by_priority, int))
     waiting: list[dict[CaseSet | None, int]] = field(default_factory=partial(by_priority, dict))

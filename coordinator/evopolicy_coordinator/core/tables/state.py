@@ -112,6 +112,8 @@ class State:
 
         # Workers and leases.
         self.workers: dict[str, Worker] = {}
+        self.machines: dict[str, dict[str, Worker]] = {}
+        """Workers by the machine whose credentials they joined with."""
         self.awaited: dict[str, None] = {}
         """Undescribed environments that an operator requested."""
         self.sessions: dict[str, str] = {}
