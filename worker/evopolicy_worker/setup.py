@@ -81,8 +81,7 @@ def _wanted(names: Sequence[str]) -> dict[str, Install]:
         if each.pins and len(wanted) > 1:
             alone = installs.setup_line(name)
             raise ConfigError(f"{name} excludes packages of other families: set it up alone, with `{alone}`")
-        first, beyond = (tuple(map(int, version.split("."))) for version in each.python)
-        if not first <= sys.version_info[:2] < beyond:
+        if not each.fits:
             raise ConfigError(
                 f"{name} is tested with Python {each.python[0]} up to, but not including, {each.python[1]}: install"
                 " evopolicy with such a Python, and run setup there"

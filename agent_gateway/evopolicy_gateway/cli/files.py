@@ -6,6 +6,7 @@ that stand below the fields in the source, so the schema, the code and `docs/ref
 
 from __future__ import annotations
 
+import inspect
 import shutil
 from collections.abc import Callable
 from functools import partial
@@ -69,6 +70,9 @@ def schema(name: str) -> dict[str, Any]:
         raise ConfigError(f"no schema {name!r}; there are {', '.join(KINDS)}")
     (root,), components = msgspec.json.schema_components([kind.type], ref_template="#/$defs/{name}")
     for each in structs(kind.type):
+        if about := components[each.__name__].get("description"):
+            # Python takes a docstring's indentation away only since 3.13.
+            components[each.__name__]["description"] = inspect.cleandoc(about)
         properties, texts = components[each.__name__]["properties"], field_texts(each)
         for field in properties.keys() & texts.keys():
             properties[field]["description"] = texts[field]

@@ -56,6 +56,12 @@ class Install(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     the words that state its licence and the installed file that has them; with none where no file states
     one."""
 
+    @property
+    def fits(self) -> bool:
+        """Whether it was tested with this interpreter's version."""
+        first, beyond = (tuple(map(int, version.split("."))) for version in self.python)
+        return first <= sys.version_info[:2] < beyond
+
 
 class Made(msgspec.Struct, frozen=True, kw_only=True):
     """A virtual environment that `setup` made, as its file `MARK` describes it."""

@@ -22,13 +22,13 @@ Warm = Callable[[str], Environment]
 
 
 def test_the_whole_catalogue_is_offered() -> None:
-    """All but the families that only an installation of their own can play."""
+    """All but the families that only another installation, or another Python, can play."""
     here = [
         each for each in entries() if not (family := installs.family_of(each)) or installs.is_here(family)
     ]
     assert here == offered()
     apart = {installs.family_of(each) for each in set(entries()) - set(here)}
-    assert apart == {name for name, each in installs.installs().items() if each.pins}
+    assert apart == {name for name, each in installs.installs().items() if each.pins or not each.fits}
 
 
 @pytest.mark.parametrize("env_id", IDS)
