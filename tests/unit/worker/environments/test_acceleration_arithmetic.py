@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import contextlib
+import copy
 import math
+from collections import Counter
+from types import SimpleNamespace
 from typing import Any
 
 import gymnasium
@@ -97,16 +100,16 @@ def test_lanes_that_run_askew_have_the_librarys_numbers() -> None:
 
 
 def test_the_closest_lane_is_the_librarys(network: Any) -> None:
-    shapes = tuple(highway_closest_lane._shape(lane) for lane in network.lanes_list())
-    mapped = highway_closest_lane._Map(shapes)  # type: ignore[arg-type]
-    indexes = list(network.lanes_dict())
-    decided = 0
-    for position, heading in positions(network, 4000, seed=1):
-        closest = mapped.closest(float(position[0]), float(position[1]), float(heading))
-        if closest is not None:
-            decided += 1
-            assert indexes[closest] == RoadNetwork.get_closest_lane_index(network, position, heading)
-    assert decided > 2000
+    mapped = copy.deepcopy(network)
+    highway_closest_lane._map_network(SimpleNamespace(road=SimpleNamespace(network=mapped)))
+    candidates = Counter[bool]()
+    at_rest = [(np.zeros(2), heading) for heading in (0.0, math.pi / 2, 1.0)]
+    for position, heading in (*at_rest, *positions(network, 4000, seed=1)):
+        expected = RoadNetwork.get_closest_lane_index(network, position, heading)
+        assert mapped.get_closest_lane_index(position, heading) == expected
+        candidates[len(mapped._map.closest(*position.tolist(), float(heading))) > 1] += 1
+    assert candidates[False] > 2000
+    assert candidates[True] > 0
 
 
 def test_every_estimate_and_bound_of_a_distance_holds(network: Any) -> None:

@@ -1,8 +1,8 @@
 """highway-env: the lane closest to a position, without computing the distance to every lane.
 
 Replaces `RoadNetwork.get_closest_lane_index`, which takes the first minimum of a distance over all lanes. Only *which*
-lane it is matters, so distances are estimated, in scalars, with an error below 1e-9 m; where the best two estimates are
-closer than DOUBT, the library decides. Lanes that cannot be the closest are not even estimated: the plane is divided
+lane it is matters, so distances are estimated, in scalars, with an error below 1e-9 m; the library's distance decides
+between those within DOUBT of the least. Lanes that cannot be the closest are not even estimated: the plane is divided
 into square cells, and for each cell the lanes are sorted by a lower bound of their distance from any point of it, in
 metres and without the heading's part, which is not negative. The bounds hold because the distance, |lateral| plus
 what the longitudinal coordinate sticks out of the lane, is the length of a path to the lane, or to the rectangle that
@@ -112,14 +112,15 @@ class _Map:
         self._all = [(-math.inf, index) for index in range(len(shapes))] if len(shapes) <= _FEW else None
         self._cells: dict[Pair, list[tuple[float, int]]] = {}
 
-    def closest(self, x: float, y: float, heading: float) -> int | None:
-        """Position of the closest lane in the list; None where it is too close a thing."""
+    def closest(self, x: float, y: float, heading: float) -> list[int]:
+        """Positions in the list, in order, of the lanes that may be the closest; empty where estimates do not hold."""
         key = (x // CELL, y // CELL)
         cell = self._all or self._cells.get(key) or self._cell(key)
         best = second = math.inf
-        closest = None
+        closest = -1
         lanes = self._lanes
         for bound, index in cell:
+            # A lane that is not looked at is further than its bound, which has DOUBT to spare.
             if bound > best:
                 break
             distance = lanes[index].estimate(x, y, heading)
@@ -127,8 +128,12 @@ class _Map:
                 best, second, closest = distance, best, index
             elif distance < second:
                 second = distance
-        # A lane that was not looked at is further than its bound, which has DOUBT to spare.
-        return closest if best >= 0 and second - best > DOUBT else None
+        if not best >= 0:
+            return []
+        if second - best > DOUBT:
+            return [closest]
+        near = [index for bound, index in cell if bound <= best]
+        return sorted(index for index in near if lanes[index].estimate(x, y, heading) - best <= DOUBT)
 
     def _cell(self, key: Pair) -> list[tuple[float, int]]:
         x, y = (key[0] + 0.5) * CELL, (key[1] + 0.5) * CELL
@@ -147,14 +152,17 @@ class MappedNetwork(RoadNetwork):  # type: ignore[misc]
     """A network that knows the shapes of its lanes; none is added later."""
 
     _map: _Map
-    _indexes: list[Index]
+    _known: list[tuple[Index, Any]]
+    """The index of each lane, and the lane."""
 
     def get_closest_lane_index(self, position: Any, heading: float | None = None) -> Index:
         x, y = float(position[0]), float(position[1])
         if heading is not None and abs(x) < _REACH and abs(y) < _REACH and abs(heading) < _REACH:
-            closest = self._map.closest(x, y, float(heading))
-            if closest is not None:
-                return self._indexes[closest]
+            near = self._map.closest(x, y, float(heading))
+            if len(near) > 1:  # of several at the same distance the first, as with the library
+                near.sort(key=lambda each: self._known[each][1].distance_with_heading(position, heading))
+            if near:
+                return self._known[near[0]][0]
         return cast(Index, super().get_closest_lane_index(position, heading))
 
 
@@ -164,7 +172,7 @@ def _map_network(env: Any) -> None:
     if None not in shapes:
         specialise(network, MappedNetwork)
         network._map = _map(tuple(shapes))
-        network._indexes = list(network.lanes_dict())
+        network._known = list(network.lanes_dict().items())
 
 
 def _shape(lane: Any) -> Shape | None:

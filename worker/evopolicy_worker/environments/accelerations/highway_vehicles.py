@@ -143,7 +143,6 @@ class ScalarRoad(Road):  # type: ignore[misc]
     def act(self) -> None:
         for vehicle in self.vehicles:
             quicken(vehicle)
-        self._note_places()
         self._sorted = {}
         super().act()
         self._sorted = None
@@ -157,10 +156,9 @@ class ScalarRoad(Road):  # type: ignore[misc]
         if not lane_index:
             return None, None
         s = self.network.get_lane(lane_index).local_coordinates(vehicle.position)[0]
-        known = self._sorted
-        if known is None:
+        known = {} if self._sorted is None else self._sorted
+        if not known:
             self._note_places()
-            known = {}
         if lane_index not in known:
             known[lane_index] = self._along(lane_index)
         places, things = known[lane_index]
