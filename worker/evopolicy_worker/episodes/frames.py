@@ -22,6 +22,7 @@ from evopolicy_common.messages.environment import SpaceSchema
 from evopolicy_worker.environments.interface.actions import MAX_ITEMS
 from evopolicy_worker.environments.interface.spaces import VARYING, array_of, parts
 from evopolicy_worker.sandbox.inside.policy_server import (
+    ACT,
     ARRAY,
     FLOAT,
     FLOATS,
@@ -30,6 +31,7 @@ from evopolicy_worker.sandbox.inside.policy_server import (
     MAX_AXES,
     MAX_USED,
     NONE,
+    REQUEST_HEADER,
     numbers_of,
 )
 
@@ -38,8 +40,8 @@ MAX_DEPTH = 24
 _MOST_DIGITS = 1300
 """Of an integer of more than 64 bits."""
 
-Writer = Callable[[Any], list[Any]]
-"""From an observation to the buffers of its payload, in order."""
+Writer = Callable[[Any], tuple[list[Any], int]]
+"""From an observation to the request for an action, as buffers in order, and its bytes."""
 
 Step = Callable[[Any, list[Any]], None]
 """Appends the buffers of a value, or of a part of it."""
@@ -77,25 +79,29 @@ _report_decoder = msgspec.json.Decoder(Report)
 def compile_writer(space: SpaceSchema) -> Writer:
     """How observations of this space are laid out: fixed arrays and ints, each on a multiple of 8 bytes, then texts."""
     if space["type"] in ("Box", "Image"):
-        shape = tuple(space["shape"])
+        shape, dtype = array_of(space)
+        n = math.prod(shape) * dtype.itemsize
+        header = REQUEST_HEADER.pack(n, ACT, 0)
 
-        def write_array(obs: Any) -> list[Any]:
-            if obs.shape != shape:
-                raise WorkerError(f"the environment gave an observation of shape {obs.shape}, not {shape}")
-            return [obs]
+        def write_array(obs: Any) -> tuple[list[Any], int]:
+            if obs.shape != shape or obs.nbytes != n:
+                given = f"shape {obs.shape} and dtype {obs.dtype}"
+                raise WorkerError(f"the environment gave an observation of {given}, not {shape} and {dtype}")
+            return [header, obs], len(header) + n
 
         return write_array
     leaves = sorted(_leaves(space), key=lambda leaf: leaf[1]["type"] in ("Text", *VARYING))
     steps = [(path, _step(part, padded=True)) for path, part in leaves]
 
-    def write(obs: Any) -> list[Any]:
+    def write(obs: Any) -> tuple[list[Any], int]:
         out: list[Any] = []
         for path, step in steps:
             value = obs
             for key in path:
                 value = value[key]
             step(value, out)
-        return out
+        n = sum(len(part) if type(part) is bytes else part.nbytes for part in out)
+        return [REQUEST_HEADER.pack(n, ACT, 0), *out], REQUEST_HEADER.size + n
 
     return write
 

@@ -8,8 +8,9 @@ Rules:
   before its first `act`.
 - When a recording is replayed, its actions replace the policy's, up to its last step. The episode then stops, even if
   the environment did not end it.
-- Between a policy's calls the same work is done in every split, since a policy can measure the time: each step goes to
-  both recorders, although hidden episodes keep only the actions. `_Course` owns the recordings and this balance.
+- Between a policy's calls the same work is done in every split, since a policy can measure the time: each step is
+  recorded as feedback has it, although hidden episodes keep only the actions. `_Course` owns the recordings and this
+  balance.
   Pictures are compressed after the end as far as memory allows (`rendered.HELD_BYTES`).
 - A video is made from the episode's actions after the job's last policy has ended (see `video.py`); the episode itself
   never renders, and no policy waits for a video.
@@ -40,6 +41,7 @@ An attempt at an episode, by where its actions come from (`_Episode._source`):
 from __future__ import annotations
 
 import contextlib
+import gc
 import hashlib
 import itertools
 import sys
@@ -236,7 +238,10 @@ class JobPlayer:
         if environment is None:
             while len(self._environments) >= MAX_WARM_ENVIRONMENTS:
                 self._environments.popitem(last=False)[1].close()
+            gc.unfreeze()
             environment = self._environments[env_id] = environments.make(env_id)
+            # To search all that is loaded for garbage takes as long as an episode.
+            gc.freeze()
         self._environments.move_to_end(env_id)
         return environment
 
@@ -371,7 +376,7 @@ class _Episode:
 
 
 class _Course:
-    """An episode so far: its sums, how it ended, and two recordings of it."""
+    """An episode so far: its sums, how it ended, and what is recorded of it."""
 
     def __init__(self, job: Job, environment: Environment, recorded: list[Returned] | None) -> None:
         description = environment.description
@@ -384,15 +389,15 @@ class _Course:
         self._truncated_at = job.max_steps or sys.maxsize
         self._n_recorded = len(recorded or ())
         self._last_mark = FAILED if job.failed_episodes == "end-submit" else None
+        self._form = job.observations
         self.full: Recorder | None = None
         """Of everything, as feedback has it, with the actions as the policy returned them."""
         if job.record == "full" and not job.render:
             self.full = Recorder("full", job.observations)
         elif job.record == "full" or job.bundle is not None:
             self.full = Renderer(job.observations, description.obs_storage)
-        kept = job.record == "actions" or job.video or job.bundle is not None
-        self.actions = Recorder("actions", job.observations) if kept else None
-        """Of the actions as played, which hidden results and videos need."""
+        self._played: list[tuple[Any, float]] = []
+        """The actions as played, with their rewards, which hidden results and videos need."""
 
     def add(self, obs: Any, returned: Any, action: Any, mark: str, step: Step) -> bool:
         """Adds the step that follows `obs`; whether the episode ends with it."""
@@ -411,8 +416,7 @@ class _Course:
             info = {**info, mark: True}
         if self.full is not None:
             self.full.append(obs, returned, reward, terminated, truncated, info)
-        if self.actions is not None:
-            self.actions.append(None, action, reward, terminated, truncated, info)
+        self._played.append((action, reward))
         self.total += reward
         self.terminated, self.truncated = terminated, truncated
         return terminated or truncated or length == self._n_recorded or mark == self._last_mark
@@ -422,7 +426,13 @@ class _Course:
         # A policy of several episodes can measure the pause between them, in which feedback is made and sent.
         pauses = job.policy_scope == "submit"
         rows = self.full.finish() if self.full and (pauses or job.record == "full") else b""
-        log = self.actions.finish() if self.actions and (pauses or job.record != "full" or job.video) else b""
+        log = b""
+        if (pauses and job.bundle is not None) or job.record != "full" or job.video:
+            actions, last = Recorder("actions", self._form), self.length - 1
+            for t, (action, reward) in enumerate(self._played):
+                ends = t == last
+                actions.append(None, action, reward, ends and self.terminated, ends and self.truncated, {})
+            log = actions.finish()
         return rows, log
 
 

@@ -126,7 +126,7 @@ class PolicyProcess:
         # If they cannot be read, those of Python with numpy.
         self._base_bytes, self._base_resident = proc.sizes(child.host_pid) or (1 << 29, 1 << 25)
         self._oom_kills = oom_kills
-        self._write: frames.Writer = list
+        self._write: frames.Writer
         self._action_bytes = 0
         self._usual_bytes = 0
         self._surplus_bytes = 0
@@ -219,13 +219,7 @@ class PolicyProcess:
 
     def act(self, obs: Any) -> Any:
         """The policy's answer to one observation, as it returned it. Raises PolicyFailedError."""
-        parts = self._write(obs)
-        length = 0
-        for part in parts:
-            length += part.nbytes if type(part) is not bytes else len(part)
-        tag, payload = self._exchange(
-            [policy_server.REQUEST_HEADER.pack(length, policy_server.ACT, 0), *parts], 16 + length
-        )
+        tag, payload = self._exchange(*self._write(obs))
         if tag <= policy_server.GENERIC:
             if len(payload) > self._action_bytes + _ARRAY_HEAD_BYTES:
                 how = f"it sent an action of {len(payload):,} bytes; {self._action_bytes:,} are the limit"

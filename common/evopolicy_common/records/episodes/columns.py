@@ -34,7 +34,7 @@ def pack(values: list[Any]) -> list[Any]:
     n = len(values)
     first = values[0]
     kind = type(first)
-    if any(type(value) is not kind for value in values):
+    if set(map(type, values)) != {kind}:
         return ["values", values]
     if kind is np.ndarray:
         if all(value.dtype == first.dtype and value.shape == first.shape for value in values):
@@ -42,7 +42,7 @@ def pack(values: list[Any]) -> list[Any]:
             joined = b"".join([value.tobytes() for value in values])
             return ["array", n, first.dtype.str, list(first.shape), joined]
     elif kind is int:
-        if all(-(2**63) <= value < 2**63 for value in values):
+        if min(values) >= -(2**63) and max(values) < 2**63:
             return ["scalar", "<i8", np.array(values, dtype="<i8").tobytes()]
     elif kind is float:
         return ["scalar", "<f8", np.array(values, dtype="<f8").tobytes()]
@@ -71,12 +71,12 @@ class Pictures:
         self._pieces: list[bytes] = []
 
     def add(self, picture: Any, /) -> bool:
-        """Adds a picture. Returns False, without a change, when its shape or dtype differs from the first."""
+        """Adds a picture. Returns True, without a change, when its shape or dtype differs from the first."""
         if type(picture) is not np.ndarray or picture.dtype != self._dtype or picture.shape != self._shape:
-            return False
+            return True
         self._pieces.append(self._stream.compress(np.ascontiguousarray(picture).data))
         self._n += 1
-        return True
+        return False
 
     def packed(self) -> list[Any]:
         """The packed column. Nothing may be added afterwards."""
@@ -105,7 +105,7 @@ class Column:
         return self.data[t] if self.kind == "values" else self._each(lambda part: part.row(t))
 
     def rows(self) -> list[Any]:
-        return [self.row(t) for t in range(self.n)]
+        return self.data.tolist() if self.kind == "scalar" else [self.row(t) for t in range(self.n)]
 
     def values(self) -> Any:
         """The column in the form described at `Trajectory.obs`."""

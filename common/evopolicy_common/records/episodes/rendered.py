@@ -140,15 +140,15 @@ class Renderer(Recorder):
         else:
             yield File(name=OBSERVATIONS, size=sum(map(len, pieces)), packed="as it is"), pieces
 
-    def _taker(self, obs: Any, is_picture: bool) -> Callable[[Any], bool]:
+    def _taker(self, obs: Any, is_picture: bool) -> Callable[[Any], bool | None]:
         # Arrays are held outside the block: a block of pictures would be large.
-        return self._take_array if self._npz is not None and isinstance(obs, np.ndarray) else self._take_small
+        return self._take_array if self._npz is not None and isinstance(obs, np.ndarray) else self._obs.append
 
     def _take_array(self, obs: Any) -> bool:
         if isinstance(obs, np.ndarray):
             self._hold(SINGLE, obs[np.newaxis])
-            return True
-        return False
+            return False
+        return True
 
     def _flush(self) -> None:
         first = self._n_packed

@@ -123,7 +123,7 @@ class Recorder:
         if not self._rewards:
             self._begin_block(obs, action)
         if self._full:
-            while not self._take(obs):
+            while self._take(obs):
                 # Shape or dtype differs from the pictures before: start a new block of the kind that fits.
                 self._flush()
                 self._begin_block(obs, action)
@@ -150,16 +150,12 @@ class Recorder:
             self._take = self._taker(obs, is_picture)
         self._block_rows = max(1, min(BLOCK_ROWS, most))
 
-    def _taker(self, obs: Any, is_picture: bool) -> Callable[[Any], bool]:
-        """Takes the observations of a block that begins with `obs`; returns False for one of another form."""
+    def _taker(self, obs: Any, is_picture: bool) -> Callable[[Any], bool | None]:
+        """Takes the observations of a block that begins with `obs`; returns True for one of another form."""
         if not is_picture:
-            return self._take_small
+            return self._obs.append
         self._pictures = columns.Pictures(obs)
         return self._pictures.add
-
-    def _take_small(self, obs: Any) -> bool:
-        self._obs.append(obs)
-        return True
 
     def _clear(self) -> None:
         self._pictures = None

@@ -209,7 +209,8 @@ def everything() -> Iterator[Environment]:
 def received(environment: Environment, obs: Any, *, as_lists: bool) -> Any:
     """The observation as the policy's process reads it from the bytes that are sent."""
     space = json.loads(json.dumps(environment.description.obs_space))
-    data = b"".join(map(bytes, compile_writer(space)(obs)))
+    (_, *parts), _ = compile_writer(space)(obs)
+    data = b"".join(map(bytes, parts))
     _, read = policy_server.observation_reader(space, as_lists)
     return read(bytearray(data), len(data))
 

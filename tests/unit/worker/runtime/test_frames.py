@@ -45,7 +45,14 @@ def test_observations_arrive_as_they_were_sent(first: str, second: str, number: 
         "d": np.array([3, 1]),
         "e": second,
     }
-    payload = b"".join(bytes(part) for part in frames.compile_writer(SPACE)(obs))
+    parts, n = frames.compile_writer(SPACE)(obs)
+    request = b"".join(map(bytes, parts))
+    head = policy_server.REQUEST_HEADER.size
+    payload = request[head:]
+    assert (len(request), policy_server.REQUEST_HEADER.unpack(request[:head])) == (
+        n,
+        (len(payload), policy_server.ACT, 0),
+    )
     make_buffer, read = policy_server.observation_reader(SPACE, False)
     buffer = make_buffer()
     if len(buffer) < len(payload):
@@ -59,9 +66,10 @@ def test_observations_arrive_as_they_were_sent(first: str, second: str, number: 
     assert (got["d"].tolist(), got["d"].dtype) == ([3, 1], np.int64)
 
 
-def test_an_observation_of_another_shape_is_the_environments_fault() -> None:
+@pytest.mark.parametrize("obs", [np.zeros(4, np.float32), np.zeros(3)])
+def test_an_observation_of_another_shape_is_the_environments_fault(obs: Any) -> None:
     with pytest.raises(WorkerError, match="shape"):
-        frames.compile_writer({"type": "Box", "shape": [3], "dtype": "float32"})(np.zeros(4, np.float32))
+        frames.compile_writer({"type": "Box", "shape": [3], "dtype": "float32"})(obs)
 
 
 @settings(max_examples=400)
