@@ -1,8 +1,7 @@
 """Writes the configuration of a site's own Zenoh router, `zenohd`, from the coordinator's own rules.
 
-A site's machines connect to its router, which connects to the coordinator (or to another router on the way). Each
-router restricts the machines behind it to their roles, as the coordinator does, because access rules see only the
-next neighbour.
+A site's machines connect to its router, which connects to the coordinator. The router restricts the machines behind it
+to their roles, as the coordinator does, because access rules see only the next neighbour.
 
     FOLDER/                      the router's folder, from `evopolicy-coordinator certs issue router NAME --out FOLDER`
       ca.pem, cert.pem, key.pem
@@ -59,10 +58,6 @@ def router_config(
             help=f"Endpoint to connect to; default: the coordinator's first --host, port {PORT}; may be repeated."
         ),
     ] = None,
-    uplink: Annotated[
-        str,
-        typer.Option(help="Name in that endpoint's certificate: coordinator, or router/NAME."),
-    ] = certs.COORDINATOR,
     admit: Annotated[
         list[str] | None,
         typer.Option(
@@ -86,7 +81,7 @@ def router_config(
             f"router/{name} is not admitted: evopolicy-coordinator certs issue router {name}"
             f" --host ITS_ADDRESS --out {folder}"
         )
-    for identity in (*(admit or ()), *(() if uplink == certs.COORDINATOR else (uplink,))):
+    for identity in admit or ():
         if identity not in known:
             raise ConfigError(f"{identity!r} is not admitted; there are: {', '.join(known)}")
     if not (folder / "key.pem").exists():
@@ -105,7 +100,7 @@ def router_config(
         [(machine.role, machine.identity) for machine in admitted],
         TlsFiles(**{each: str(there / file) for each, file in files.items()}),
         upstream,
-        uplink,
+        certs.COORDINATOR,
         own.identity,
         own.password,
     )

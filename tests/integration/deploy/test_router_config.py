@@ -130,24 +130,6 @@ async def test_a_workers_liveliness_is_seen_through_the_router_and_no_one_elses(
         await eventually(lambda: alive == [(true, True), (true, False)])
 
 
-async def test_a_router_behind_another_one_passes_on_as_far_as_roles_allow(site: Site) -> None:
-    far = site.certs.issue("router", "far")
-    endpoint = f"tls/127.0.0.1:{free_port()}"
-    places = {"listen": [endpoint], "connect": [site.endpoint]}
-    router_config("far", far, site.certs.state, **places, uplink="router/site", admit=["worker/elsewhere"])
-    site.configure("router/far", "worker/here")
-    alive: list[tuple[str, bool]] = []
-    found = credentials.find("worker", (endpoint,), site.elsewhere)
-    async with site.up(alive), open_router(far), transport.connect(found, timeout_s=30.0) as link:
-        assert await answered(link, KEYS["worker"], attempts=300)
-        assert not await answered(link, KEYS["gateway"])
-        key = keys.liveliness_key(CLUSTER, "elsewhere")
-        link.declare_alive(key)
-        await eventually(lambda: alive == [(key, True)])
-        async with site.link("worker") as other:
-            assert await answered(other, KEYS["worker"], attempts=300)
-
-
 async def test_a_restarted_router_carries_on(site: Site) -> None:
     async with contextlib.AsyncExitStack() as stack:
         async with site.up():
