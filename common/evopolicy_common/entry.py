@@ -44,6 +44,5 @@ def _interrupted(_: int, __: FrameType | None) -> None:
 
 evopolicy = partial(_start, "evopolicy_gateway.cli.main", "main")
 coordinator = partial(_start, "evopolicy_coordinator.cli", "program")
-gateway = partial(_start, "evopolicy_gateway.cli", "gateway_program")
 worker = partial(_start, "evopolicy_worker.cli", "main")
 """The programs: `evopolicy` and, with a hyphen after it, the others."""

@@ -13,7 +13,6 @@ import typer
 
 from evopolicy_coordinator.cli.main import app as coordinator
 from evopolicy_gateway.cli.main import app as front
-from evopolicy_gateway.cli.serve import app as gateway
 from evopolicy_gateway.declared import SET, declared
 from evopolicy_gateway.jail.settings import JailSettings
 from evopolicy_gateway.run.run_options import ListenerOptions, RunOptions
@@ -30,7 +29,7 @@ TYPER = ("help", "install_completion", "show_completion")
 
 def page() -> str:
     """The page's Markdown. A row that several commands have is in one list at its start, one for each option."""
-    apps = {"": front, "-coordinator": coordinator, "-worker": worker, "-gateway": gateway}
+    apps = {"": front, "-coordinator": coordinator, "-worker": worker}
     trees = {f"evopolicy{name}": typer.main.get_command(app) for name, app in apps.items()}
     found = [each for name, command in trees.items() for each in _commands(name, command, 2)]
     rows = Counter(

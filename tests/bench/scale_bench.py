@@ -203,18 +203,21 @@ class Run:
         found = msgspec.structs.replace(coordinator.credentials("gateway"), token=capability)
         credentials.write(found, self.folder.credentials)
         save(self.folder.opened_run, OpenedRun(run=run))
+        self.said = root / "gateway.jsonl"
+        pipes = {"stdin": subprocess.PIPE, "stdout": stack.enter_context(self.said.open("wb"))}
         self.process = stack.enter_context(
-            child("-m", "evopolicy_gateway.cli.serve", str(root), log=self.log, stdout=subprocess.PIPE)
+            child("-m", "evopolicy_gateway.cli.serve", str(root), log=self.log, **pipes)
         )
         self._url = ""
 
     def serving(self) -> None:
         """Waits until it serves."""
-        assert self.process.stdout is not None
-        name = "EVOPOLICYGYM_SUBMIT_URL="
-        lines = iter(self.process.stdout.readline, "")
-        self._url = next((line for line in lines if line.startswith(name)), "").removeprefix(name).strip()
-        assert self._url, f"a gateway did not start: {self.log.read_text()}"
+        while not self._url:
+            assert self.process.poll() is None, f"a gateway did not start: {self.log.read_text()}"
+            time.sleep(0.02)
+            lines = self.said.read_text().splitlines(keepends=True)
+            told = [json.loads(line) for line in lines if '"variables"' in line and line.endswith("\n")]
+            self._url = told[0]["variables"]["EVOPOLICYGYM_SUBMIT_URL"] if told else ""
         (self.folder.system / "policy.py").write_text(POLICY)
 
     def submit(self, ids: list[int]) -> None:

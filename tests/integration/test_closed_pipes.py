@@ -19,7 +19,6 @@ from evopolicy_common.terminal import READER_GONE
 MODULES = {
     "evopolicy": "evopolicy_gateway.cli",
     "evopolicy-coordinator": "evopolicy_coordinator.cli",
-    "evopolicy-gateway": "evopolicy_gateway.cli.serve",
     "evopolicy-worker": "evopolicy_worker.cli",
 }
 TIMEOUT_S = 300

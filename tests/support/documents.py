@@ -14,13 +14,11 @@ import typer
 
 from evopolicy_coordinator.cli import main as coordinator_cli
 from evopolicy_gateway.cli import main as gateway_cli
-from evopolicy_gateway.cli import serve as serve_cli
 from evopolicy_worker import cli as worker_cli
 
 APPS = {
     "evopolicy": gateway_cli.app,
     "evopolicy-coordinator": coordinator_cli.app,
-    "evopolicy-gateway": serve_cli.app,
     "evopolicy-worker": worker_cli.app,
 }
 

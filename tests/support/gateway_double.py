@@ -539,7 +539,7 @@ class Served(msgspec.Struct, frozen=True):
 
 
 @contextlib.asynccontextmanager
-async def gateway_on(folder: RunFolder, double: Double, **more: Any) -> AsyncIterator[Served]:
+async def gateway_on(folder: RunFolder, double: Double) -> AsyncIterator[Served]:
     """A gateway on that folder; stopped without closing the run at the end, if it still serves."""
     waits: list[str] = []
     ready: asyncio.Future[tuple[Urls, SubmitPipeline]] = asyncio.get_running_loop().create_future()
@@ -548,7 +548,6 @@ async def gateway_on(folder: RunFolder, double: Double, **more: Any) -> AsyncIte
         on_ready=lambda urls, pipeline: ready.set_result((urls, pipeline)),
         on_change=lambda pipeline: None,
         on_wait=waits.append,
-        **{"alone": False, **more},
     )
     task = asyncio.create_task(gateway.run())
     await asyncio.wait([task, ready], return_when=asyncio.FIRST_COMPLETED)

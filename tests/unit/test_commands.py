@@ -24,7 +24,6 @@ PROGRAMS = sorted(APPS)
 MODULES = {
     "evopolicy": "evopolicy_common.entry:evopolicy",
     "evopolicy-coordinator": "evopolicy_common.entry:coordinator",
-    "evopolicy-gateway": "evopolicy_common.entry:gateway",
     "evopolicy-worker": "evopolicy_common.entry:worker",
 }
 
@@ -192,7 +191,6 @@ run_app(app)
 @pytest.mark.parametrize(
     ("modules", "words", "extra"),
     [
-        ("starlette,uvicorn,h11", ["evopolicy-gateway", "x"], "gateway"),
         ("starlette,uvicorn,h11", ["evopolicy", "local", "--env", "toy", "--agent", "evolve"], "local"),
         ("cryptography", ["evopolicy", "demo"], "local"),
         ("cryptography", ["evopolicy", "try", STILL, "--env", "toy/line"], "local"),
@@ -216,12 +214,11 @@ def test_a_command_without_its_extra_names_it(
 
 
 def test_a_program_without_its_extra_tells_its_version(tmp_path: Path) -> None:
-    for program in ("evopolicy-coordinator", "evopolicy-gateway"):
-        done = without("cryptography,uvicorn", [program, "--version"], tmp_path)
-        assert (done.returncode, done.stdout.partition(" ")[0]) == (0, "evopolicy"), done.stderr
-        done = without("cryptography,uvicorn", [program, "--help"], tmp_path)
-        assert done.returncode == 2
-        assert "evopolicy files docs/reference/cli.md`" in done.stderr
+    done = without("cryptography,uvicorn", ["evopolicy-coordinator", "--version"], tmp_path)
+    assert (done.returncode, done.stdout.partition(" ")[0]) == (0, "evopolicy"), done.stderr
+    done = without("cryptography,uvicorn", ["evopolicy-coordinator", "--help"], tmp_path)
+    assert done.returncode == 2
+    assert "evopolicy files docs/reference/cli.md`" in done.stderr
 
 
 @pytest.mark.parametrize("words", [["status"], ["verify", "x"], ["data", "check", "x"], ["gc", "--dry-run"]])

@@ -170,7 +170,6 @@ def test_the_cores_modules_build_on_those_below_them_only() -> None:
 OWN_STDOUT = {
     "evopolicy_gateway/agents": "programs of their own, whose stdout is an agent's log",
     "evopolicy_gateway/jail/entry.py": "inside the jail, with the standard library alone",
-    "evopolicy_gateway/cli/serve.py": "URLs of its own, for a shell to read",
     "evopolicy_common/processes/parent_death.py": "becomes another program, with the standard library alone",
     "evopolicy_worker/environments/interface/calls.py": "speaks with the process that started it",
     "evopolicy_worker/sandbox/inside": "inside the sandbox, with the standard library alone",

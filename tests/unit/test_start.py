@@ -112,7 +112,6 @@ getattr(entry, program)()
     [
         ("typer", "evopolicy", "--help"),
         ("typer", "coordinator", "--help"),
-        ("typer", "gateway", "--help"),
         ("typer", "worker", "--help"),
         ("evopolicy_coordinator.cli.status", "evopolicy", "status"),
         ("evopolicy_coordinator.server", "coordinator", "identity"),

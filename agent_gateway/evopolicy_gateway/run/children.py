@@ -98,7 +98,7 @@ class GatewayProcess(Kept):
         while True:
             started = time.monotonic()
             run.stopwatch.begins("gateway")
-            child = await self._start("evopolicy_gateway.cli.serve", str(run.folder.root), "--controlled")
+            child = await self._start("evopolicy_gateway.cli.serve", str(run.folder.root))
             async for event in child.events():
                 await self._on_event(event)
             code = await child.ended()

@@ -53,13 +53,10 @@ class Gateway:
         on_ready: Callable[[Urls, SubmitPipeline], None],
         on_change: Callable[[SubmitPipeline], None],
         on_wait: Callable[[str], None] = lambda waits_for: None,
-        alone: bool,
     ) -> None:
-        """`on_wait` receives the reason for waiting, other than the agent, or an empty text when the wait is over.
-        `alone`: no other process watches the agent."""
+        """`on_wait` receives the reason for waiting, other than the agent, or an empty text when the wait is over."""
         self._folder = folder
         self._on_ready, self._on_change, self._on_wait = on_ready, on_change, on_wait
-        self._alone = alone
         self._stopped = asyncio.Event()
         """Set to leave the run open."""
         self.permit_s = 0.0
@@ -115,8 +112,6 @@ class Gateway:
 
     async def _permitted(self, session: CoordinatorClient, place: AgentPlace) -> bool:
         """True when the permit is granted or the run is to be closed; False when ordered to leave the run open."""
-        if self._alone:
-            self._folder.unwatched.touch(mode=0o600)
         requested_at = time.monotonic()
         permit = session.permit(place, self._on_wait)
         try:
@@ -127,7 +122,7 @@ class Gateway:
         return not self._stopped.is_set() if granted is None else granted
 
     async def _watch(self, pipeline: SubmitPipeline, http: asyncio.Task[None]) -> CloseRun | None:
-        """Reports changes until `tell`; returns its argument, or a `CloseRun` of its own when it decides to end."""
+        """Reports changes until `tell`; returns its argument."""
         self._changed.set()
         while True:
             changed = asyncio.ensure_future(self._changed.wait())
@@ -142,9 +137,6 @@ class Gateway:
                 return self._orders.result()
             self._changed.clear()
             self._on_change(pipeline)
-            spent = pipeline.machine.spent
-            if self._alone and (spent or self._folder.finish.exists()):
-                return CloseRun(reason="budget_spent" if spent else "agent_stopped")
 
     async def _close(self, pipeline: SubmitPipeline, close: CloseRun) -> bool:
         await asyncio.to_thread(save, self._folder.closing, close)
@@ -159,7 +151,7 @@ class Gateway:
 
     async def _agent_gone(self, pipeline: SubmitPipeline) -> bool:
         """True once the agent has ended as far as anyone can tell; False when first ordered to leave the run open."""
-        unseen = self._alone or ends_unseen(self._folder)
+        unseen = ends_unseen(self._folder)
         while unseen and not (
             pipeline.machine.cancelled or self._folder.finish.exists() or self._stopped.is_set()
         ):

@@ -98,8 +98,6 @@ class RunFolder(msgspec.Struct, frozen=True):
     closed the run, also after it was started on an earlier backup."""
     finish = Place(f"{open_run.STATE}/finish")
     """Created when the operator reports the end of an agent that was not started here."""
-    unwatched = Place(open_run.UNWATCHED)
-    """Created by a gateway that was started by hand: only the operator knows the end of its unwatched agent."""
     journal = Place(open_run.JOURNAL)
     """The gateway's record of requests; see `journal.py`."""
     blobs = Place(open_run.BUNDLES)

@@ -129,8 +129,8 @@ def place_notice(agent_host: str, root: Path) -> str:
 
 
 def finish(folder: RunFolder) -> None:
-    """Reports the end of an open run's agent. Raises ConfigError unless the agent is remote or unwatched."""
-    if not folder.listener.exists() and not folder.unwatched.exists():
+    """Reports the end of an open run's agent. Raises ConfigError unless the agent is remote."""
+    if not folder.listener.exists():
         raise ConfigError(
             f"{folder.root} is no open run of a remote agent; name its run directory, or wait for an agent that a"
             " command started"

@@ -30,7 +30,7 @@ def asked(double: Double, kind: type[Asked]) -> list[Asked]:
     return [message for message in double.asked if isinstance(message, kind)]
 
 
-def quiet(folder: RunFolder, *, alone: bool = False, **more: object) -> tuple[Gateway, list[object]]:
+def quiet(folder: RunFolder) -> tuple[Gateway, list[object]]:
     """A gateway, and what it has said: URLs once it serves, texts of what it waits for."""
     events: list[object] = []
     gateway = Gateway(
@@ -38,8 +38,6 @@ def quiet(folder: RunFolder, *, alone: bool = False, **more: object) -> tuple[Ga
         on_ready=lambda urls, pipeline: events.append(urls),
         on_change=lambda pipeline: None,
         on_wait=events.append,
-        alone=alone,
-        **more,  # type: ignore[arg-type]
     )
     return gateway, events
 
@@ -154,18 +152,6 @@ async def test_a_gateway_stopped_before_its_agents_end_leaves_the_run_open(tmp_p
             service.gateway.tell(None)
             assert not await service.task
     assert double.closed is None
-
-
-async def test_agent_that_nobody_watches_ends_by_its_operators_word(tmp_path: Path) -> None:
-    known = prepared(tmp_path, Double(opened(episode_budget=1)))
-    async with known as (folder, double), gateway_on(folder, double, alone=True) as service:
-        await service.submit([1])
-        await until(lambda: len(service.waits) > 1)
-        assert "evopolicy finish" in service.waits[1]
-        assert double.closed is None
-        listener.finish(folder)
-        assert await service.task
-    assert asked(double, RequestPermit)[0].boot_id == proc.boot_id()
 
 
 async def test_time_held_by_hidden_episodes_counts_against_no_limit(tmp_path: Path) -> None:

@@ -89,8 +89,7 @@ def episode_files(episode, *args, **options):
 submits.episode_files = episode_files
 
 async def main():
-    gateway = Gateway(RunFolder(Path(sys.argv[1])), on_ready=lambda urls, pipeline: None, on_change=on_change,
-                      alone=True)
+    gateway = Gateway(RunFolder(Path(sys.argv[1])), on_ready=lambda urls, pipeline: None, on_change=on_change)
     await gateway.run()
 
 def on_change(pipeline):

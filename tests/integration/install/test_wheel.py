@@ -183,7 +183,7 @@ def test_commands_complete_and_the_agents_of_the_extras_start(place: Place) -> N
     # The rest of the line, as the shell asks for it.
     asked = ["env", "_EVOPOLICY_COMPLETE=complete_bash", "COMP_WORDS=evopolicy do", "COMP_CWORD=1"]
     assert place.run([*asked, "evopolicy"]).split() == ["doctor"]
-    for program in ("evopolicy-coordinator", "evopolicy-gateway", "evopolicy-worker"):
+    for program in ("evopolicy-coordinator", "evopolicy-worker"):
         assert (
             place.run([program, "--version"]).split()[-1] == place.run(["evopolicy", "--version"]).split()[-1]
         )

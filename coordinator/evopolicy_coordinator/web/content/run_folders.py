@@ -395,7 +395,7 @@ def _decoded(folder: Path, name: str, kind: type[T]) -> T | None:
 
 def _agent_alive(folder: Path) -> bool:
     """Whether an agent of an open run may be alive: a lock of its folder is held, or no process here watches it."""
-    if any((folder / path).exists() for path in (open_run.LISTENER, open_run.UNWATCHED)):
+    if (folder / open_run.LISTENER).exists():
         return True
     with contextlib.suppress(OSError):
         state = (folder / open_run.STATE).iterdir()

@@ -2,24 +2,15 @@
 
 from __future__ import annotations
 
-import itertools
 import json
 import os
-import re
 import signal
-import subprocess
-import sys
-import time
-import urllib.request
 from pathlib import Path
 
 import pytest
 from commands import Plays, agent, command, ended, record_in, run_arguments, run_dir, toy_cluster
 from coordinator_harness import Coordinator
-from waiting import TIMEOUT_S, wait_until
-
-from evopolicy_gateway.run_folder import listener
-from evopolicy_gateway.run_folder.layout import RunFolder
+from waiting import wait_until
 
 pytestmark = pytest.mark.system
 
@@ -158,34 +149,3 @@ def test_interruptions_do_not_reset_the_agents_time(operator_file: Path, tmp_pat
     record = record_in(run_dir(tmp_path))
     assert (record.outcome.closed_reason, record.outcome.budget_used) == ("wall_limit", 2)
     assert record.timing.agent_s > 86000.0
-
-
-def test_an_open_run_is_taken_over_by_a_gateway_started_by_hand(operator_file: Path, tmp_path: Path) -> None:
-    waits = agent(tmp_path, "submit([0, 1])\nopen('here', 'w')\ntime.sleep(1000)")
-    with command(tmp_path, *run_arguments(operator_file, waits)) as running:
-        wait_until(lambda: [*(tmp_path / "runs").glob("*/*/t/workspace/here")])
-        running.kill()
-    folder = run_dir(tmp_path)
-    known = re.findall(r"http://\S+/submit", (folder / "workspace" / "AGENTS.md").read_text())
-    by_hand = subprocess.Popen(
-        [sys.executable, "-m", "evopolicy_gateway.cli.serve", str(folder)],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.DEVNULL,
-        text=True,
-    )
-    try:
-        assert by_hand.stdout is not None
-        lines = iter(by_hand.stdout.readline, "")
-        assert f"EVOPOLICYGYM_SUBMIT_URL={known[0]}\n" in itertools.islice(lines, 4)
-        body = json.dumps({"env_instances": "0-3"}).encode()
-        with urllib.request.urlopen(urllib.request.Request(known[0], data=body)) as answer:
-            assert json.load(answer)["submit_id"] == 1
-        # Nobody watches this agent: its run is closed by its operator's word.
-        time.sleep(2.0)
-        assert by_hand.poll() is None
-        listener.finish(RunFolder(folder))
-        assert by_hand.wait(timeout=TIMEOUT_S) == 0
-    finally:
-        by_hand.kill()
-        by_hand.communicate()
-    assert RunFolder(folder).closing.exists()

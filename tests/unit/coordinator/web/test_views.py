@@ -11,6 +11,7 @@ from invented.web_site import client, finished_run, open_run, open_status, site_
 
 from evopolicy_common.messages.run_settings import Start
 from evopolicy_common.messages.status import RetriedJobs
+from evopolicy_common.records.open_run import LISTENER
 from evopolicy_coordinator.web.content.cluster import _RETRIES_OF_A_RUN
 from evopolicy_coordinator.web.content.run_folders import key_of
 
@@ -107,7 +108,7 @@ def test_a_runs_page_hides_its_selection_while_a_related_agent_may_live(tmp_path
     with client(site_of(tmp_path / "a")) as browser:
         shown = browser.get(f"/run/{key(folder)}").text
     live = open_run(tmp_path / "b")
-    (live / ".gateway" / "unwatched").touch()
+    (live / LISTENER).touch()
     with client(site_of(tmp_path / "a", tmp_path / "b")) as browser:
         hidden = browser.get(f"/run/{key(folder)}").text
     for text in (">selected</span>", "validation mean -111.2", 'id="phases"', "4242"):
