@@ -77,10 +77,10 @@ class Rule(NamedTuple):
     """Completes the sentence "give …"."""
 
 
-def _checked(kind: type[Any], *, filled: bool = False) -> Callable[[Any], Any]:
+def _checked(kind: type[object], *, filled: bool = False) -> Callable[[Any], Any]:
     """Takes values of a type; `filled`: not an empty one."""
 
-    def checked(value: Any) -> Any:
+    def checked(value: object) -> Any:
         if not isinstance(value, kind) or (filled and not value):
             raise TypeError
         return value
@@ -115,11 +115,11 @@ def _least(least: float) -> Callable[[Any], float]:
     return checked
 
 
-def _agent(value: Any) -> Any:
+def _agent(value: object) -> Any:
     return value if callable(value) else _text(value)
 
 
-def _policy(value: Any) -> Any:
+def _policy(value: object) -> Any:
     if isinstance(value, type):
         raise TypeError
     return value if callable(value) else _path(value)
@@ -135,16 +135,16 @@ def _names(value: Any) -> tuple[str, ...]:
     return tuple(sorted({_text(name) for name in value}))
 
 
-def _limits(value: Any) -> ResourceLimits:
+def _limits(value: object) -> ResourceLimits:
     if not isinstance(value, Mapping) or any(isinstance(number, str | bool) for number in value.values()):
         raise TypeError
     return limits_from({_text(name): float(number) for name, number in value.items()}, "limits: ")
 
 
-def _choice(kind: Any) -> Rule:
+def _choice(kind: object) -> Rule:
     allowed = get_args(kind)
 
-    def checked(value: Any) -> Any:
+    def checked(value: object) -> Any:
         if value not in allowed:
             raise ValueError
         return value
@@ -206,12 +206,12 @@ RULES: dict[str, Rule] = {
 """By the name of the argument."""
 
 
-def taken(**given: Any) -> dict[str, Any]:
+def taken(**given: object) -> dict[str, Any]:
     """The arguments as they are used. Raises ConfigError that names the first wrong one."""
     return {name: check_argument(name, value) for name, value in given.items()}
 
 
-def check_argument(name: str, value: Any) -> Any:
+def check_argument(name: str, value: object) -> Any:
     """As `taken`, for one argument."""
     rule = RULES[name]
     try:

@@ -284,7 +284,7 @@ def trial_of(
 
 
 def plan_of(
-    env: str, agent: str, *, listener: Listener | None = None, agent_host: str = "", **options: Any
+    env: str, agent: str, *, listener: Listener | None = None, agent_host: str = "", **options: object
 ) -> Plan:
     """The plan of a run; arguments as for `run`, and for an agent that is started elsewhere as in `Plan`. Raises
     ConfigError."""

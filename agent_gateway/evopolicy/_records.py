@@ -77,7 +77,7 @@ class Records(Sequence[R], Generic[R]):
         return f"<table><tr>{head}</tr>{body}</table>{more}"
 
 
-def _text(value: Any) -> str:
+def _text(value: object) -> str:
     return "–" if value is None else f"{value:.4g}" if isinstance(value, float) else str(value)
 
 

@@ -122,7 +122,7 @@ def set_values(known: Mapping[str, Declared], texts: Sequence[str]) -> dict[str,
     return values
 
 
-def literals(kind: Any) -> tuple[Any, ...]:
+def literals(kind: object) -> tuple[Any, ...]:
     """The values of a Literal; none of another type."""
     return get_args(kind) if get_origin(kind) is Literal else ()
 

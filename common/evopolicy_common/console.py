@@ -113,7 +113,7 @@ def table(*headings: str, right: Collection[str] = (), whole: Collection[str] = 
 
 
 def listing(
-    records: Iterable[Any],
+    records: Iterable[object],
     columns: Mapping[str, Callable[[Any], str]],
     *,
     right: Collection[str] = (),

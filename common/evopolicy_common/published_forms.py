@@ -9,7 +9,9 @@ _IMAGE = {"layout": "height_width_channels", "value_range": [0, 255], "storage":
 _CHANNELS = (1, 3, 4)
 
 
-def described(obs_space: Mapping[str, Any], action_space: Mapping[str, Any], storage: str) -> dict[str, Any]:
+def described(
+    obs_space: Mapping[str, object], action_space: Mapping[str, object], storage: str
+) -> dict[str, Any]:
     """The fields of `env_meta` that differ from ours: spaces, storage of observations, and `reward_components`.
 
     Arrays of bytes with channels are images, which are stored beside the rows, and MiniGrid's sentences a space of

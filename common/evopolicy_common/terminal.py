@@ -48,7 +48,7 @@ def shortened(text: str) -> str:
 _NUMBERS = re.compile(r"[-+]?[0-9][0-9.]*(?:e[-+]?[0-9]+)?(?: to [-+]?[0-9][0-9.]*(?:e[-+]?[0-9]+)?)?")
 
 
-def csv_cell(value: Any) -> Any:
+def csv_cell(value: object) -> Any:
     """The value for a CSV file: empty for None; texts `harmless`, an apostrophe before formulas."""
     if value is None:
         return ""
@@ -108,7 +108,7 @@ def say_lines(lines: Iterable[str], *, err: bool = False) -> None:
         say(one_line(line), err=err)
 
 
-def say_json(value: Any, *, indent: bool = True) -> None:
+def say_json(value: object, *, indent: bool = True) -> None:
     """Prints `value` as JSON on stdout, indented or on one line. Unprintable characters are escaped."""
     import json
 

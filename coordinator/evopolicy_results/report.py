@@ -133,7 +133,7 @@ def check_folder(out: Path, is_ours: Callable[[str], bool], kind: str) -> None:
         )
 
 
-def _made(item: tuple[dict[str, set[tuple[str, str]]], partial[Any]]) -> Any:
+def _made(item: tuple[dict[str, set[tuple[str, str]]], partial[object]]) -> Any:
     names_in_runs.update(item[0])  # those of another process
     made = item[1]()
     if not isinstance(made, Plot):
@@ -143,7 +143,7 @@ def _made(item: tuple[dict[str, set[tuple[str, str]]], partial[Any]]) -> Any:
     return drawn(made)
 
 
-def _lost(item: tuple[Any, partial[Any]], why: str) -> Any:
+def _lost(item: tuple[object, partial[object]], why: str) -> Any:
     """Replaces a run's page whose process ended; a figure has nothing of an agent's that could end its process."""
     if item[1].func is not _page:
         raise ChildProcessError(why)

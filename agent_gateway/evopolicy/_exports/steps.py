@@ -140,7 +140,7 @@ class _Log:
         step.results.append(Result(call=call, text=_text(part.value), failed=part.failed))
 
 
-def _text(value: Any, depth: int = 0) -> str:
+def _text(value: object, depth: int = 0) -> str:
     """A text, or the texts within content blocks; anything else as JSON."""
     if value is None or isinstance(value, str):
         return value or ""
@@ -153,7 +153,7 @@ def _text(value: Any, depth: int = 0) -> str:
     return _json(value)
 
 
-def _is_deeper(value: Any, levels: int) -> bool:
+def _is_deeper(value: object, levels: int) -> bool:
     """Whether lists and objects are nested more than `levels` deep."""
     if not isinstance(value, dict | list):
         return False
@@ -161,11 +161,11 @@ def _is_deeper(value: Any, levels: int) -> bool:
     return levels == 0 or any(_is_deeper(one, levels - 1) for one in inner)
 
 
-def _json(value: Any) -> str:
+def _json(value: object) -> str:
     return msgspec.json.encode(value).decode()
 
 
-def _time(value: Any) -> str | None:
+def _time(value: object) -> str | None:
     try:
         return datetime.fromisoformat(value).isoformat() if isinstance(value, str) else None
     except ValueError:

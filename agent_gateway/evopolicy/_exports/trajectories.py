@@ -102,7 +102,7 @@ def _form(columns: Any) -> Any:
     return "text" if isinstance(columns, list) else (columns.dtype.kind, columns.shape[1:])
 
 
-def _left_out(about: dict[str, Any], why: str) -> None:
+def _left_out(about: dict[str, object], why: str) -> None:
     say(f"{about['run']}: submit {about['submit']}, episode {about['episode']}: left out: {why}", err=True)
 
 
@@ -181,7 +181,7 @@ def _rows(path: Path) -> Iterator[_Row]:
             yield _Row(*values, row["terminated"], row["truncated"])
 
 
-def _packed(value: Any) -> Any:
+def _packed(value: object) -> Any:
     import numpy as np
 
     if isinstance(value, dict):
@@ -214,7 +214,7 @@ def _columns(values: list[Any]) -> Any:
     return np.asarray(_floats(values), dtype=np.float64)
 
 
-def _floats(value: Any) -> Any:
+def _floats(value: object) -> Any:
     return [_floats(each) for each in value] if isinstance(value, list) else _number(value)
 
 

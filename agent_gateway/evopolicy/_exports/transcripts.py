@@ -73,7 +73,7 @@ def _about(run: Run) -> dict[str, Any]:
     return {name: value for name, value in msgspec.to_builtins(run.summary).items() if name != "run"}
 
 
-def _without_none(**values: Any) -> dict[str, Any]:
+def _without_none(**values: object) -> dict[str, Any]:
     return {name: value for name, value in values.items() if value not in (None, "", [], {})}
 
 

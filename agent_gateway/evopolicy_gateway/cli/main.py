@@ -123,7 +123,7 @@ class _TopLevel(Group):
                 return None
             raise
 
-    def command_groups(self, ctx: Any) -> dict[str, list[tuple[str, str]]]:
+    def command_groups(self, ctx: object) -> dict[str, list[tuple[str, str]]]:
         return {heading: list(helps.items()) for heading, helps in GROUPS.items()}
 
 

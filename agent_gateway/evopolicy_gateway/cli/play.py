@@ -221,7 +221,7 @@ def finish(
         listener.finish(folder_of(run_directory))
 
 
-def _plans(given: RunOptions, env_ids: list[str], agent_host: str = "", **more: Any) -> list[Plan]:
+def _plans(given: RunOptions, env_ids: list[str], agent_host: str = "", **more: object) -> list[Plan]:
     """A plan for each environment. Raises ConfigError for any error before anything is started."""
     if given.resume and (given.overwrite or given.exp_id is None):
         raise ConfigError("--resume needs --exp-id, and cannot be combined with --overwrite")

@@ -41,7 +41,7 @@ class CommandHarness(Harness):
         self,
         name: str,
         program: list[str],
-        settings: dict[str, Any] | None = None,
+        settings: dict[str, object] | None = None,
         hint: str = "",
         continues: bool = False,
     ) -> None:

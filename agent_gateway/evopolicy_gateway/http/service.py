@@ -148,7 +148,7 @@ async def _read_body(request: Request) -> bytes:
     return bytes(body)
 
 
-def _json(status: int, document: dict[str, Any], headers: Mapping[str, str] | None = None) -> Response:
+def _json(status: int, document: dict[str, object], headers: Mapping[str, str] | None = None) -> Response:
     return Response(orjson.dumps(document), status, headers, "application/json")
 
 
@@ -270,7 +270,7 @@ _COUNTS = ("episode_budget", "min_episodes_per_submit", "max_episodes_per_submit
 _SETTINGS = ("policy_scope", "finish", "feedback", "observations", "sandbox_tier", "video")
 
 
-def info_document(machine: TicketMachine, left: Mapping[str, Any] | None = None) -> dict[str, Any]:
+def info_document(machine: TicketMachine, left: Mapping[str, object] | None = None) -> dict[str, Any]:
     """The document of `GET /info`: everything that an agent may know of the run, as plain values.
 
     `left`: of the agent's own limits.

@@ -130,7 +130,7 @@ def _document(name: str, text: str) -> Any:
     return tomllib.loads(text) if name.endswith(".toml") else json.loads(text)
 
 
-def _secrets_in(value: Any, name: str = "") -> Iterator[str]:
+def _secrets_in(value: object, name: str = "") -> Iterator[str]:
     if isinstance(value, str) and (is_secret(name) or name in _OPENCODES):
         yield value
     elif isinstance(value, dict):

@@ -84,7 +84,7 @@ class TrialResult(msgspec.Struct, frozen=True, kw_only=True):
 
 
 async def try_policy(
-    env: str, policy: Path, cases: Sequence[int], out: Path, where: Cluster, *, as_json: bool, **more: Any
+    env: str, policy: Path, cases: Sequence[int], out: Path, where: Cluster, *, as_json: bool, **more: object
 ) -> int:
     """Plays the policy on train cases and prints the results; returns 1 if it failed in an episode, else 0.
 

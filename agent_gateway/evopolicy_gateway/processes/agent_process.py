@@ -50,7 +50,7 @@ class AgentLog:
             document["cut_bytes"] = len(line) - len(cut)
         self.note(document)
 
-    def note(self, document: dict[str, Any]) -> None:
+    def note(self, document: dict[str, object]) -> None:
         """Logs a line of our own, such as a prompt. It may hold parts of an agent's message."""
         try:
             line = orjson.dumps(document)

@@ -136,7 +136,7 @@ class AnswerReader:
             return False
         return self._read(_decoded(data))
 
-    def _read(self, document: Any) -> bool:
+    def _read(self, document: object) -> bool:
         if isinstance(document, list):
             # Google's stream without events is one list of documents.
             for each in document:
@@ -156,7 +156,7 @@ class AnswerReader:
         self.complete = self.complete or document.get("type") in shape.last
         return told and document.get("choices") == []
 
-    def _count(self, path: str, value: Any) -> bool:
+    def _count(self, path: str, value: object) -> bool:
         """Takes a count; a missing one (null) is none."""
         if value is None:
             return False
@@ -192,7 +192,7 @@ def values(document: Any, path: str) -> Iterator[Any]:
             yield value
 
 
-def _name(document: Any, paths: tuple[str, ...]) -> str:
+def _name(document: object, paths: tuple[str, ...]) -> str:
     found = [each for path in paths for each in values(document, path) if isinstance(each, str)]
     return found[-1][:_MAX_NAME] if found else ""
 

@@ -10,7 +10,6 @@ import difflib
 import itertools
 import json
 import re
-from typing import Any
 
 import orjson
 
@@ -103,7 +102,7 @@ def canonical(api: str, body: bytes) -> bytes:
     return body
 
 
-def _remove(value: Any, path: list[str]) -> None:
+def _remove(value: object, path: list[str]) -> None:
     head, *rest = path
     if head == "*":
         for each in value if isinstance(value, list) else ():
@@ -115,7 +114,7 @@ def _remove(value: Any, path: list[str]) -> None:
             value.pop(head, None)
 
 
-def difference(recorded: Any, now: Any) -> str:
+def difference(recorded: object, now: object) -> str:
     """How two canonical requests differ from the first difference on, in at most `MAX_LINES` lines of a unified diff.
 
     Compares no more lines than are shown: a diff takes quadratic time, and an agent writes the texts.

@@ -153,18 +153,18 @@ def _no_number(text: str) -> None:
     raise ValueError(f"{text} is not a number of JSON")
 
 
-def _is_count(value: Any) -> bool:
+def _is_count(value: object) -> bool:
     return isinstance(value, int) and not isinstance(value, bool) and 0 < value <= MAX_TOKENS
 
 
-def _with_counts(document: dict[str, Any]) -> bytes | None:
+def _with_counts(document: dict[str, object]) -> bytes | None:
     options = document.get("stream_options") or {}
     if document.get("stream") is not True or not isinstance(options, dict) or options.get("include_usage"):
         return None
     return orjson.dumps(document | {"stream_options": options | {"include_usage": True}})
 
 
-def _tools(document: dict[str, Any], rules: Rules) -> tuple[list[str], list[str]]:
+def _tools(document: dict[str, object], rules: Rules) -> tuple[list[str], list[str]]:
     """The kinds of tools that the provider runs, without the version of Anthropic's, and the places of unknown parts.
     An unknown kind counts as one of these."""
     hosted: list[str] = []
@@ -181,7 +181,7 @@ def _tools(document: dict[str, Any], rules: Rules) -> tuple[list[str], list[str]
     return hosted, unknown
 
 
-def _offered(document: dict[str, Any]) -> Iterator[tuple[str, Any]]:
+def _offered(document: dict[str, object]) -> Iterator[tuple[str, Any]]:
     """Every tool with its place: those of a message (a search for tools brings some) and of a namespace too."""
     items = document.get("input")
     holders = [("", document)] + [
@@ -200,7 +200,7 @@ def _offered(document: dict[str, Any]) -> Iterator[tuple[str, Any]]:
             yield place, tool
 
 
-def _kinds(tool: Any, rules: Rules) -> list[tuple[str, dict[str, Any]]]:
+def _kinds(tool: object, rules: Rules) -> list[tuple[str, dict[str, Any]]]:
     """The kinds in a tool, each with its part: Google's may hold several."""
     if not isinstance(tool, dict):
         return []
@@ -212,7 +212,7 @@ def _kinds(tool: Any, rules: Rules) -> list[tuple[str, dict[str, Any]]]:
     return [(re.sub(r"_\d{8}$", "", str(tool.get("type") or "custom")), tool)]
 
 
-def _unknown(value: Any, known: Any, at: str) -> Iterator[str]:
+def _unknown(value: object, known: object, at: str) -> Iterator[str]:
     """The places in `value` that a template does not know."""
     if isinstance(known, str):
         if value != known:
@@ -233,5 +233,5 @@ def _unknown(value: Any, known: Any, at: str) -> Iterator[str]:
         yield at
 
 
-def _has_text(known: Any) -> bool:
+def _has_text(known: object) -> bool:
     return isinstance(known, dict) and any(isinstance(each, str) for each in known.values())

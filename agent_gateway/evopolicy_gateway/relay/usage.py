@@ -83,7 +83,7 @@ MAX_COUNT = 10**12
 """Limit of one reported count, above any real turn, so that sums of counts stay numbers that every reader accepts."""
 
 
-def count(value: Any) -> int:
+def count(value: object) -> int:
     """A count from a stream, at most `MAX_COUNT`; 0 for an invalid one."""
     return (
         min(value, MAX_COUNT) if isinstance(value, int) and not isinstance(value, bool) and value > 0 else 0

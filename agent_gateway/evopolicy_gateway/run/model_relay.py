@@ -15,7 +15,6 @@ import sys
 import sysconfig
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
 
 import msgspec
 
@@ -99,7 +98,7 @@ class ModelRelay(Kept):
         self._run.note(f"model use: {used.requests:,} requests ({used.failed:,} failed), {use_words(tokens)}")
 
 
-def use_words(tokens: Mapping[str, Any]) -> str:
+def use_words(tokens: Mapping[str, object]) -> str:
     """Tokens by kind and their cost, in the form of `run.json`, for people."""
     kinds = ", ".join(f"{name.replace('_', ' ')} {n:,}" for name, n in tokens.items() if name != "cost")
     price = f"{tokens['cost']:,.2f} dollars" if "cost" in tokens else "no prices known"

@@ -112,7 +112,7 @@ class Operations(OperatorClient):
         holder: str,
         ttl_s: float,
         run: str = "",
-        result: dict[str, Any] | None = None,
+        result: dict[str, object] | None = None,
     ) -> messages.ClaimState:
         """Takes, renews, releases (`ttl_s` 0) or settles (`result`) a run of a sweep."""
         known: dict[str, Any] = {"suite": suite, "name": name, "holder": holder, "ttl_s": ttl_s}

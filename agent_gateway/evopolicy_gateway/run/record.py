@@ -164,7 +164,7 @@ async def write(
 
 def claims(
     plan: Plan,
-    facts: dict[str, Any],
+    facts: dict[str, object],
     staged: Staged | None = None,
     rejected: Sequence[Rejected] = (),
     times: Times = _NO_TIMES,
@@ -196,7 +196,7 @@ def claims(
     )
 
 
-def told_at_close(folder: RunFolder, plan: Plan, facts: dict[str, Any], times: Times) -> dict[str, Any]:
+def told_at_close(folder: RunFolder, plan: Plan, facts: dict[str, object], times: Times) -> dict[str, Any]:
     """The `Told` of `run.json`, as it is published: the coordinator commits to it when the run ends."""
     staged = saved(folder.staged, Staged) if folder.staged.exists() else None
     known = claims(plan, _complete(folder, plan, facts), staged, times=times)

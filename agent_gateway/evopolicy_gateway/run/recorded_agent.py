@@ -143,7 +143,7 @@ def _code(kept: Recorded) -> str:
     return hmac.new(key, data, "sha256").hexdigest() if len(key) == 32 else ""
 
 
-def _plain(value: Any) -> Any:
+def _plain(value: object) -> Any:
     return msgspec.to_builtins(value, enc_hook=str)
 
 

@@ -9,7 +9,7 @@ import contextlib
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import msgspec
 
@@ -76,7 +76,7 @@ class Stopwatch:
     def begins(self, process: Process) -> None:
         self._base += self._reported.pop(process, Times())
 
-    def reported(self, process: Process, **counts: Any) -> None:
+    def reported(self, process: Process, **counts: object) -> None:
         """Sets counts of a present process; saves those of an agent."""
         before = self._reported.get(process, Times())
         self._reported[process] = msgspec.structs.replace(before, **counts)

@@ -89,7 +89,7 @@ class View(ABC):
             return f"waiting for {details['what']}"
         return str(details.get("text", ""))
 
-    def event(self, kind: str, run: str, **more: Any) -> None:
+    def event(self, kind: str, run: str, **more: object) -> None:
         if self._console is None or (self._drawn and kind not in self.above):
             return
         if text := self.event_text(kind, run, more):

@@ -138,7 +138,7 @@ class CoordinatorClient:
             file.flush()
             return cast(bytes, memoryview(mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)))
 
-    async def close(self, reason: str, agent: dict[str, Any], after: int) -> None:
+    async def close(self, reason: str, agent: dict[str, object], after: int) -> None:
         """Closes the run to further submits than the `after` accepted ones. Call it only when the agent and all its
         children are gone."""
         message = messages.CloseRun(**self._known, reason=reason, agent=agent, after=after)

@@ -161,7 +161,7 @@ def _where(scores: Sequence[EpisodeFeedback], categories: frozenset[str] | None)
     )
 
 
-def _line(at: float, category: str, message: str, traceback: str | None, **more: Any) -> bytes:
+def _line(at: float, category: str, message: str, traceback: str | None, **more: object) -> bytes:
     """A line of JSON; to fit 64 KiB its traceback (from the start) and then its message are cut."""
     line: dict[str, Any] = {"schema_version": SCHEMA_VERSION, "timestamp": utc_text(at), "category": category}
     line |= {"message": message, "traceback": traceback, **more}

@@ -15,7 +15,7 @@ import time
 import uuid
 from collections.abc import Callable
 from functools import partial
-from typing import Any, TypeVar
+from typing import TypeVar
 
 from evopolicy_common.errors import RefusedError, RequestError, StorageError
 from evopolicy_common.logs import structlog
@@ -131,7 +131,7 @@ class SubmitPipeline:
         while self._task is not None and not self._task.done():
             await asyncio.wait([self._task])
 
-    async def close(self, reason: str, agent: dict[str, Any]) -> None:
+    async def close(self, reason: str, agent: dict[str, object]) -> None:
         """Closes the run at the coordinator, with all its submits."""
         while True:
             try:

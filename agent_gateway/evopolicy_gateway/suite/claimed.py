@@ -222,7 +222,7 @@ class ClaimedSweep(Sweep):
                         )
 
     async def _ask(
-        self, run: Plan, ttl_s: float | None = None, result: dict[str, Any] | None = None
+        self, run: Plan, ttl_s: float | None = None, result: dict[str, object] | None = None
     ) -> ClaimState:
         # By its digest, a run with other settings is another run, and an earlier result does not count for it.
         name = f"{run.name}@{run.digest}"

@@ -111,7 +111,7 @@ def _hidden_cases(run: Plan) -> str:
     return run.settings.env if run.settings.hidden_cases == "shared" else run.name
 
 
-def _changed(before: Mapping[str, Any], now: Mapping[str, Any]) -> str:
+def _changed(before: Mapping[str, object], now: Mapping[str, object]) -> str:
     text = "the file has other settings for it now"
     if not before:
         return text
@@ -126,7 +126,7 @@ def _first(texts: Sequence[str]) -> str:
     return ", ".join(texts[:_SHOWN]) + (f" and {more} more" if more > 0 else "")
 
 
-def _leaves(path: str, value: Any) -> Iterator[tuple[str, Any]]:
+def _leaves(path: str, value: object) -> Iterator[tuple[str, Any]]:
     """Settings by their dotted names in the suite's file."""
     if isinstance(value, dict):
         for name, inner in value.items():
@@ -135,7 +135,7 @@ def _leaves(path: str, value: Any) -> Iterator[tuple[str, Any]]:
         yield path, value
 
 
-def _shown(value: Any) -> str:
+def _shown(value: object) -> str:
     return "not set" if value is None else msgspec.json.encode(value).decode()
 
 

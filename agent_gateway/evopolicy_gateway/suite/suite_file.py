@@ -170,7 +170,7 @@ def _explained(problem: str, text: str) -> str:
     return f"{place}: {problem}" + (f"; did you mean {near[0]}?" if near else "")
 
 
-def _allowed(kind: Any) -> list[str]:
+def _allowed(kind: object) -> list[str]:
     """The values of the Literals in a type."""
     if found := literals(kind):
         return [*map(repr, found)]

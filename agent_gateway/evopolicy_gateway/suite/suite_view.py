@@ -90,7 +90,7 @@ class SuiteView(View):
         self.on_doing(run, doing)
         super().doing(run, doing)
 
-    def event(self, kind: str, run: str, **more: Any) -> None:
+    def event(self, kind: str, run: str, **more: object) -> None:
         super().event(kind, run, **more)
         if kind == "finished" and not self._drawn:
             self._print(self.totals())
@@ -165,7 +165,7 @@ class SuiteView(View):
 class JsonView(SuiteView):
     """Prints one JSON object per line on stdout."""
 
-    def event(self, kind: str, run: str, **more: Any) -> None:
+    def event(self, kind: str, run: str, **more: object) -> None:
         document = {"event": kind, "at": round(time.time(), 3), **({"run": run} if run else {}), **more}
         say_json(document, indent=False)
 

@@ -153,7 +153,7 @@ def read_file(path: Path) -> tuple[Entry, ...]:
     return entries
 
 
-def _entry(path: Path, table: dict[str, Any]) -> Entry:
+def _entry(path: Path, table: dict[str, object]) -> Entry:
     fields = dict(table)
     where = f"environment file {path}, environment {fields.get('id', 'without id')!s:.80}"
     known = [name for name in Entry.__struct_fields__ if name not in _SHIPPED_ONLY] + ["task_file"]
@@ -175,7 +175,7 @@ def _entry(path: Path, table: dict[str, Any]) -> Entry:
     return entry
 
 
-def _task(where: str, path: Path, fields: dict[str, Any], task_file: object) -> str:
+def _task(where: str, path: Path, fields: dict[str, object], task_file: object) -> str:
     if "task" in fields:
         raise ConfigError(f"{where}: task and task_file exclude each other: give only one of them")
     if not isinstance(task_file, str):
@@ -258,7 +258,7 @@ def _fault(entry: Entry) -> str:
     return ""
 
 
-def _is_plain(value: Any) -> bool:
+def _is_plain(value: object) -> bool:
     if isinstance(value, dict):
         return all(isinstance(key, str) and _is_plain(item) for key, item in value.items())
     if isinstance(value, list):

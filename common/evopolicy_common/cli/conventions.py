@@ -81,7 +81,7 @@ def setup_logging(level: str = "info") -> None:
 
     from evopolicy_common.logs import structlog
 
-    def harmless_values(_: Any, __: str, event: MutableMapping[str, Any]) -> MutableMapping[str, Any]:
+    def harmless_values(_: object, __: str, event: MutableMapping[str, object]) -> MutableMapping[str, Any]:
         # Any value may contain text of a policy or an agent. JSON lines escape it.
         return {name: harmless(value) if isinstance(value, str) else value for name, value in event.items()}
 

@@ -104,7 +104,7 @@ class _Help:
                 raise typer.BadParameter(why, ctx=ctx, param=param)
         return rest
 
-    def invoke(self, ctx: Any) -> Any:
+    def invoke(self, ctx: object) -> Any:
         if not isinstance(self, TyperGroup) or self.invoke_without_command:
             interruptible()
         setup_notices()  # not earlier: help and completion log nothing and do not need structlog
@@ -146,7 +146,7 @@ class App(typer.Typer):
         usual = {"cls": Group, "rich_markup_mode": None, "add_completion": False}
         super().__init__(**(usual | {"context_settings": _SETTINGS} | options))
 
-    def command(self, name: str | None = None, **options: Any) -> Callable[[Function], Function]:
+    def command(self, name: str | None = None, **options: object) -> Callable[[Function], Function]:
         """As typer's; the command has grouped help and accepts `-h`."""
         usual: dict[str, Any] = {"cls": Command, "context_settings": _SETTINGS}
         return super().command(name, **(usual | options))

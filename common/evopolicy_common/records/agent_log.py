@@ -31,7 +31,7 @@ class Part(msgspec.Struct, frozen=True, kw_only=True):
     """Claude Code repeats a message's id with each of its blocks; empty if there is none."""
 
 
-def parts(line: dict[str, Any]) -> Iterator[Part]:
+def parts(line: dict[str, object]) -> Iterator[Part]:
     match line:
         case {"type": "prompt"}:
             yield Part(kind="prompt", value=line.get("message"), by_agent=False)
@@ -52,7 +52,7 @@ def parts(line: dict[str, Any]) -> Iterator[Part]:
             yield Part(kind="text", value=text)
 
 
-def _block(block: dict[str, Any], by_agent: bool, message: str) -> Iterator[Part]:
+def _block(block: dict[str, object], by_agent: bool, message: str) -> Iterator[Part]:
     match block.get("type"):
         case "text" | "thinking" as kind:
             yield Part(kind=kind, value=block.get(kind), by_agent=by_agent, message=message)
@@ -66,7 +66,7 @@ def _block(block: dict[str, Any], by_agent: bool, message: str) -> Iterator[Part
             yield Part(kind="result", value=block.get("content"), id=call, failed=failed, by_agent=False)
 
 
-def _item(item: dict[str, Any]) -> Iterator[Part]:
+def _item(item: dict[str, object]) -> Iterator[Part]:
     """A completed item of Codex: a text, or a call together with its result."""
     kind, call = _name(item.get("type") or item.get("item_type")), _name(item.get("id"))
     failed = item.get("status") == "failed" or item.get("exit_code") not in (0, None)
@@ -85,5 +85,5 @@ def _item(item: dict[str, Any]) -> Iterator[Part]:
         yield Part(kind="call", name=kind, id=call, value=given)
 
 
-def _name(value: Any) -> str:
+def _name(value: object) -> str:
     return value if isinstance(value, str) else ""

@@ -18,7 +18,7 @@ import orjson
 from evopolicy_common.errors import DECODE_ERRORS
 
 
-def json_bytes(value: Any) -> bytes:
+def json_bytes(value: object) -> bytes:
     """`value` as compact JSON: numpy arrays and numbers, tuples as lists, bytes and unknown objects as text."""
     try:
         data = orjson.dumps(value, option=orjson.OPT_SERIALIZE_NUMPY)
@@ -36,7 +36,7 @@ def json_bytes(value: Any) -> bytes:
         return json.dumps(cleaned, separators=(",", ":"), allow_nan=False, default=_numpy_as_plain).encode()
 
 
-def _numpy_as_plain(value: Any) -> Any:
+def _numpy_as_plain(value: object) -> Any:
     return json.loads(orjson.dumps(value, option=orjson.OPT_SERIALIZE_NUMPY))
 
 
@@ -81,12 +81,12 @@ _BETWEEN = b'},{"t":'
 
 def rows_text(
     first: int,
-    obs: Sequence[Any] | None,
-    actions: Iterable[Any],
+    obs: Sequence[object] | None,
+    actions: Iterable[object],
     rewards: Iterable[float],
     terminated: Iterable[bool],
     truncated: Iterable[bool],
-    infos: Iterable[Any],
+    infos: Iterable[object],
 ) -> bytes:
     """Lines of `trajectory.jsonl` from step `first` on: the bytes of `json_bytes` of each row, encoded at
     once. `obs` None: observations are stored in a file of their own."""
@@ -115,7 +115,7 @@ def rows_text(
     return b"".join([json_bytes(row) + b"\n" for row in rows])
 
 
-def as_lists(value: Any) -> Any:
+def as_lists(value: object) -> Any:
     """`value` in the form that policies with `observations` "lists" receive."""
     if isinstance(value, np.ndarray):
         return value.tolist()

@@ -143,11 +143,11 @@ def _value_differences(path: str, left: Any, right: Any) -> list[tuple[str, Any,
     return [] if type(left) is type(right) and left == right else [(path, left, right)]
 
 
-def _objects(value: Any) -> bool:
+def _objects(value: object) -> bool:
     return isinstance(value, list) and all(isinstance(item, dict) for item in value)
 
 
-def _short(value: Any) -> str:
+def _short(value: object) -> str:
     if value is ...:
         return "nothing"
     text = json.dumps(value)

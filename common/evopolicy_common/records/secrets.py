@@ -164,7 +164,7 @@ def is_secret(name: str) -> bool:
     return bool(_SECRET_NAME.search(name)) and not _NO_SECRET_NAME.search(name)
 
 
-def without_keys(value: Any, removed: list[str] | None = None) -> Any:
+def without_keys(value: object, removed: list[str] | None = None) -> Any:
     """A document without keys in its texts, command lines and lists of words; `removed` collects them."""
     removed = [] if removed is None else removed
     if isinstance(value, str):

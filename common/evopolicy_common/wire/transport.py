@@ -454,7 +454,7 @@ def _tls(tls: TlsFiles | None, side: str) -> dict[str, Any]:
     }
 
 
-def _config(settings: dict[str, Any]) -> zenoh.Config:
+def _config(settings: dict[str, object]) -> zenoh.Config:
     config = zenoh.Config()
     for key, value in settings.items():
         config.insert_json5(key, json.dumps(value))

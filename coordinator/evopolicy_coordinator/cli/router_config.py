@@ -30,7 +30,7 @@ from evopolicy_coordinator.pki.machines import Machines, write_passwords
 from evopolicy_coordinator.storage.state_folder import cluster_of
 
 
-def _nested(settings: Mapping[str, Any]) -> dict[str, Any]:
+def _nested(settings: Mapping[str, object]) -> dict[str, Any]:
     """Converts settings by key, such as `listen/endpoints`, to the tree of a configuration file."""
     tree: dict[str, Any] = {}
     for key, value in settings.items():

@@ -89,7 +89,7 @@ class ServiceReader:
         self._pages = ThreadPoolExecutor(_READERS, thread_name_prefix="pages")
         self._lanes = [ThreadPoolExecutor(1, thread_name_prefix=f"blobs-{n}") for n in range(_BLOB_LANES)]
 
-    def answer_read(self, asked: Any, answer: Answer) -> None:
+    def answer_read(self, asked: object, answer: Answer) -> None:
         """Replies to a `ReadEffect` of the core or an operator's request (`_READS`): with a page of results,
         outcomes of a finished run, published records of runs whose cases are disclosed, or a signature."""
         self._pages.submit(self._answer, partial(_READS[type(asked)], self, asked), answer)

@@ -362,7 +362,7 @@ def _started(reader: ServiceReader, wanted: RunSettings) -> tuple[RunSettings, t
     return replace(wanted, start=replace(start, parent_scored=scored, line=line)), related
 
 
-def _conditions(row: RunRow, agent: dict[str, Any]) -> Line:
+def _conditions(row: RunRow, agent: dict[str, object]) -> Line:
     """The conditions of one run. `agent`: as its gateway told when it closed; empty while it is open."""
     told, own = agent.get("record"), Line(sandbox_tier=row.settings.sandbox_tier)
     if not isinstance(told, dict):

@@ -176,7 +176,7 @@ class _Matcher(difflib.SequenceMatcher[Any]):
         return super().find_longest_match(alo, ahi, blo, bhi)
 
 
-def n_changed(old: Sequence[Any], new: Sequence[Any]) -> int:
+def n_changed(old: Sequence[object], new: Sequence[object]) -> int:
     """Number of lines removed plus lines added."""
     for _ in range(2):  # without equal lines at the beginning, then at the end
         unequal = (i for i, (a, b) in enumerate(zip(old, new, strict=False)) if a != b)

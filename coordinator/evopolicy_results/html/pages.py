@@ -162,7 +162,7 @@ def table_view(table: Table, pages: Mapping[str, str] = {}) -> dict[str, Any]:
     }
 
 
-def _cell(column: Column, value: Any, mark: int, page_of_run: str | None, text: str) -> dict[str, Any]:
+def _cell(column: Column, value: object, mark: int, page_of_run: str | None, text: str) -> dict[str, Any]:
     numeric = column.kind != "text"
     is_long = not numeric and len(str(value)) > _LONG
     classes = {"n": numeric, "first": mark == 1, "second": mark == 2}

@@ -49,7 +49,7 @@ class SubmitRow(msgspec.Struct, frozen=True, kw_only=True):
 
 def submit_rows(
     submits: Sequence[Submit],
-    summaries: Mapping[int, Any],
+    summaries: Mapping[int, object],
     *,
     traced: Mapping[int, TraceRow] | None = None,
     folder: Path | None = None,
@@ -120,8 +120,8 @@ def run_view(
     entry: str,
     env: str,
     look: Look | None,
-    facts: Iterable[tuple[str, Any]],
-    notices: Sequence[Mapping[str, Any]] = (),
+    facts: Iterable[tuple[str, object]],
+    notices: Sequence[Mapping[str, object]] = (),
     budget: int = 0,
     reference: tuple[str, float] | None = None,
     is_finished: bool = True,

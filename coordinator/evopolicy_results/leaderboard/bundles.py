@@ -15,7 +15,6 @@ import hashlib
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import msgspec
 import numpy as np
@@ -244,7 +243,7 @@ def _tell_apart(bundles: Sequence[LabBundle]) -> None:
             seen.add(each.run.name)
 
 
-def _with(each: LabRun, **changes: Any) -> LabRun:
+def _with(each: LabRun, **changes: object) -> LabRun:
     """The run with other fields of its `run.json`."""
     record = msgspec.structs.replace(each.run.record, **changes)
     return msgspec.structs.replace(each, run=msgspec.structs.replace(each.run, record=record))

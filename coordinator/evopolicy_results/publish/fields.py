@@ -120,7 +120,7 @@ def file_kind(name: str) -> str | None:
     return next((kind for kind in FIELDS if "*" in kind and _FILES[kind].fullmatch(name)), None)
 
 
-def leaves(value: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Any]]:
+def leaves(value: object, path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Any]]:
     """The paths of all numbers, texts, truth values and nulls in JSON."""
     if isinstance(value, dict | list):
         items = value.items() if isinstance(value, dict) else enumerate(value)
@@ -130,7 +130,7 @@ def leaves(value: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, 
         yield path, value
 
 
-def unknown_and_claims(name: str, value: Any, told: bool = False) -> tuple[list[str], list[str]]:
+def unknown_and_claims(name: str, value: object, told: bool = False) -> tuple[list[str], list[str]]:
     """The fields that the table does not name or that publication empties, and those that are claims.
 
     `told`: the run's result has the gateway's word."""

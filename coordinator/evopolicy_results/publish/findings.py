@@ -177,7 +177,7 @@ class Checked(msgspec.Struct, kw_only=True):
         elif not faults:
             self.add(kind, "ok", ok, run)
 
-    def refuse_unknown(self, name: str, value: Any, run: str = "", told: bool = False) -> None:
+    def refuse_unknown(self, name: str, value: object, run: str = "", told: bool = False) -> None:
         """Refuses fields that the table of `fields` does not name, and notes those that are claims."""
         unknown, claims = fields.unknown_and_claims(name, value, told)
         for field in unknown[:_SHOWN]:

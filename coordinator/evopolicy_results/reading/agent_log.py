@@ -16,7 +16,6 @@ import re
 from collections.abc import Iterator, Sequence
 from datetime import datetime
 from pathlib import Path
-from typing import Any
 
 import msgspec
 
@@ -138,7 +137,7 @@ def _lines(path: Path) -> Iterator[bytes]:
             yield line
 
 
-def _events_of(value: dict[str, Any]) -> Iterator[LogEvent]:
+def _events_of(value: dict[str, object]) -> Iterator[LogEvent]:
     at = next((at for key in _TIMES if (at := _instant(value.get(key))) is not None), None)
     for part in parts(value):
         if part.kind == "call":
@@ -150,7 +149,7 @@ def _events_of(value: dict[str, Any]) -> Iterator[LogEvent]:
             yield LogEvent(message=_clip(part.value), answered=(int(named[1]),) if named else (), at=at)
 
 
-def _call(arguments: Any, at: float | None) -> LogEvent:
+def _call(arguments: object, at: float | None) -> LogEvent:
     """A tool call, with the paths that its arguments name."""
     texts = _strings(arguments)
     read = (path.rstrip("./,") for text in texts for path in _FEEDBACK.findall(text) if _is_short(path))
@@ -170,12 +169,12 @@ def _is_short(path: str) -> bool:
     return len(path) <= _MAX_PATH_CHARS
 
 
-def _answered_submits(output: Any) -> tuple[int, ...]:
+def _answered_submits(output: object) -> tuple[int, ...]:
     numbers = (match[1] for text in _strings(output) for match in _ANSWER.finditer(text))
     return tuple(dict.fromkeys(int(number) for number in numbers if len(number) <= 9))
 
 
-def _strings(value: Any, depth: int = 0) -> list[str]:
+def _strings(value: object, depth: int = 0) -> list[str]:
     """Every string inside a JSON value, in order."""
     if isinstance(value, str):
         return [value]
@@ -183,7 +182,7 @@ def _strings(value: Any, depth: int = 0) -> list[str]:
     return [text for item in items for text in _strings(item, depth + 1)] if depth <= 6 else []
 
 
-def _instant(value: Any) -> float | None:
+def _instant(value: object) -> float | None:
     try:
         if isinstance(value, int | float) and not isinstance(value, bool):
             return float(value) / (1000.0 if value > 1e11 else 1.0)

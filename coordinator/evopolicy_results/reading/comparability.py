@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from itertools import islice
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import msgspec
 
@@ -123,7 +123,7 @@ def _step_limit(run: Run) -> str:
     return run.record.experiment_dimensions.step_limit if both else ""
 
 
-def _limits(holder: Any) -> str:
+def _limits(holder: object) -> str:
     """Its limits as `name=value` words; empty if the run has no record of them."""
     limits = getattr(holder, "limits", None)
     given = {} if limits is None else msgspec.to_builtins(limits)

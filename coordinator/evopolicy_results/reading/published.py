@@ -132,12 +132,12 @@ def read_record(folder: Path, data: bytes) -> RunRecord | None:
         raise ProtocolError(f"not a published run record: {error}") from error
 
 
-def _object(fields: dict[str, Any], name: str) -> dict[str, Any]:
+def _object(fields: dict[str, object], name: str) -> dict[str, Any]:
     value = fields.get(name)
     return value if isinstance(value, dict) else {}
 
 
-def _names(folder: Path, record: dict[str, Any], summaries: list[PublishedSummary]) -> tuple[str, str]:
+def _names(folder: Path, record: dict[str, object], summaries: list[PublishedSummary]) -> tuple[str, str]:
     """Model and environment: as recorded, or from `runs/<model>/<env>/<exp-id>`, where `_` may replace an
     environment's `/`."""
     above, two_above = folder.parent, folder.parent.parent
@@ -149,7 +149,7 @@ def _names(folder: Path, record: dict[str, Any], summaries: list[PublishedSummar
     return str(record.get("model") or by_path.get(env, two_above.name)), env
 
 
-def _budget(folder: Path, record: dict[str, Any], summaries: list[PublishedSummary]) -> int:
+def _budget(folder: Path, record: dict[str, object], summaries: list[PublishedSummary]) -> int:
     """The episode budget: as recorded, or the remaining budget before the first submit."""
     budget = _object(record, "experiment_dimensions").get("episode_budget")
     if isinstance(budget, int):

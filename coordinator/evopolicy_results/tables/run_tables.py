@@ -88,7 +88,7 @@ def tables_of_runs(study: Study) -> list[Table]:
     ]
 
 
-def one_or_all(values: Iterable[Any]) -> Any:
+def one_or_all(values: Iterable[object]) -> Any:
     """The common value of all, or `A or B` if different runs were mixed; None without any."""
     distinct = list(dict.fromkeys(values))
     return distinct[0] if len(distinct) == 1 else " or ".join(map(str, distinct)) or None
@@ -253,7 +253,7 @@ def _audit_row(run: Run) -> dict[str, Any]:
     compared = (*run.scored[:1], run.selected)
     nodes = [each.source.features.nodes for each in compared if each and each.source]
 
-    def recorded(value: Any) -> Any:
+    def recorded(value: object) -> Any:
         return None if run.is_published else value
 
     return {

@@ -27,7 +27,7 @@ DASH = "–"
 """Shown for a missing value; CSV leaves the field empty."""
 
 
-def at(record: Any, path: str) -> Any:
+def at(record: object, path: str) -> Any:
     """The attribute of a record at a path such as `gap.value`; None if an attribute on the way is None."""
     for name in path.split("."):
         record = None if record is None else getattr(record, name)
@@ -74,7 +74,7 @@ class Table(msgspec.Struct, frozen=True, kw_only=True):
     """By row, the name of the run that it is about; empty if the table is not about runs."""
 
 
-def rows_of(records: Iterable[Any], columns: Sequence[Column]) -> list[dict[str, Any]]:
+def rows_of(records: Iterable[object], columns: Sequence[Column]) -> list[dict[str, Any]]:
     return [{column.key: column.value(each) for column in columns} for each in records]
 
 

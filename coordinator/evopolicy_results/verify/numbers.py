@@ -93,12 +93,12 @@ def _stored_outcome(record: RunRecord, result: RunResult) -> Told:
     yield from unlike_documents(as_json(outcome), as_json(wanted), "outcome")
 
 
-def as_json(value: Any) -> Any:
+def as_json(value: object) -> Any:
     """The JSON document of a record."""
     return msgspec.json.decode(msgspec.json.encode(value))
 
 
-def unlike_documents(told: Any, wanted: Any, path: str = "") -> Iterator[tuple[str, Any, Any]]:
+def unlike_documents(told: object, wanted: object, path: str = "") -> Iterator[tuple[str, Any, Any]]:
     """The fields in which two JSON documents differ, by their paths, with both values (`MISSING` for none)."""
     if isinstance(told, dict) and isinstance(wanted, dict):
         for name in dict.fromkeys((*told, *wanted)):
@@ -259,7 +259,7 @@ def _unlike(
             yield file, f"{name} is {short(here)}; {source} {short(wanted)}"
 
 
-def short(value: Any) -> str:
+def short(value: object) -> str:
     """A value as a difference quotes it."""
     text = repr(value)
     return text if len(text) <= _MAX_CHARS else f"{text[: _MAX_CHARS - 1]}…"

@@ -66,7 +66,7 @@ class Events:
         result = {"is_error": True, "api_error_status": failure.status, "result": f"{failure}{wait}"}
         self._emit({"type": "result", **result})
 
-    def _emit(self, event: dict[str, Any]) -> None:
+    def _emit(self, event: dict[str, object]) -> None:
         print(json.dumps(event), file=self._out, flush=True)
 
 

@@ -274,7 +274,7 @@ def _skills(paths: Sequence[str]) -> str:
     return _SKILLS + "".join(listed) if listed else ""
 
 
-def _call(identity: str, name: str, arguments: Any) -> Call:
+def _call(identity: str, name: str, arguments: object) -> Call:
     """A call as the model wrote it, which may be anything."""
     said = _decoded(arguments)
     given = said if isinstance(said, dict) else {"text": str(said)}
@@ -293,7 +293,7 @@ def _call(identity: str, name: str, arguments: Any) -> Call:
     return Call(**known, command=command, timeout_s=min(timeout_s, shell.MOST_S))
 
 
-def _decoded(arguments: Any) -> Any:
+def _decoded(arguments: object) -> Any:
     try:
         return json.loads(arguments) if isinstance(arguments, str) else arguments
     except (ValueError, RecursionError):

@@ -67,7 +67,7 @@ async def _listed(settings: dict[str, Any], key: str, http: httpx2.AsyncClient) 
         return []
 
 
-def _messages(settings: dict[str, Any], key: str, http: httpx2.AsyncClient) -> Opened:
+def _messages(settings: dict[str, object], key: str, http: httpx2.AsyncClient) -> Opened:
     from anthropic import AsyncAnthropic
     from pydantic_ai.models.anthropic import AnthropicModel, AnthropicModelSettings
     from pydantic_ai.providers.anthropic import AnthropicProvider

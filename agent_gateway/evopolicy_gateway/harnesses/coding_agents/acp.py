@@ -141,7 +141,7 @@ class AcpAgent(CliAgent):
             await self._set(link, answer)
         return link
 
-    async def _set(self, link: _Link, answer: dict[str, Any]) -> None:
+    async def _set(self, link: _Link, answer: dict[str, object]) -> None:
         """Chooses the mode, the model and the effort of a session, as the agent's settings say.
 
         Raises AgentError when the agent offers no choice of models and is not started with this one: `run.json` would
@@ -208,7 +208,7 @@ class AcpAgent(CliAgent):
             prompt_reply.cancel()
             await asyncio.gather(prompt_reply, return_exceptions=True)
 
-    def _read(self, stage: Stage, reader: AcpReader, event: dict[str, Any]) -> None:
+    def _read(self, stage: Stage, reader: AcpReader, event: dict[str, object]) -> None:
         before = reader.action
         reader.read_event(event)
         for entry in reader.entries():
@@ -269,7 +269,7 @@ class _Link:
         chosen = {"configId": choice.option, "value": choice.values.get(value, value)}
         await self.request("session_set_config_option", {"sessionId": self.session, **chosen})
 
-    def _update(self, update: dict[str, Any]) -> None:
+    def _update(self, update: dict[str, object]) -> None:
         if self.listens:
             self.updates.put_nowait(update)
 
@@ -281,7 +281,7 @@ class _Link:
         await self._connection.close()
         await self.process.close()
 
-    async def _handle(self, method: str, params: Any, is_notification: bool) -> Any:
+    async def _handle(self, method: str, params: object, is_notification: bool) -> Any:
         from acp.exceptions import RequestError
         from acp.meta import CLIENT_METHODS
 
@@ -310,7 +310,7 @@ class _Pipe:
         self._process = process
         self._lines: AsyncIterator[bytes] = process.lines()
 
-    async def send(self, message: dict[str, Any]) -> None:
+    async def send(self, message: dict[str, object]) -> None:
         try:
             said = await self._process.say(orjson.dumps(message))
         except TypeError:

@@ -73,7 +73,7 @@ class AcpReader(TurnReader):
         self._calls: dict[str, dict[str, Any]] = {}
         """Tool calls without a result, by their ids."""
 
-    def read_event(self, event: Mapping[str, Any]) -> None:
+    def read_event(self, event: Mapping[str, object]) -> None:
         """A `session/update`."""
         kind, content = event.get("sessionUpdate"), mapping(event.get("content"))
         if kind == "agent_message_chunk":
@@ -89,7 +89,7 @@ class AcpReader(TurnReader):
         if kind in ("tool_call", "tool_call_update"):
             self._tool(event)
 
-    def _tool(self, event: Mapping[str, Any]) -> None:
+    def _tool(self, event: Mapping[str, object]) -> None:
         """A tool call, or more about one; some agents report what it does only while it runs, or when it is done."""
         self._whole()
         identity, status = string(event.get("toolCallId")), event.get("status")
@@ -110,7 +110,7 @@ class AcpReader(TurnReader):
         self._entry("user", result | {"is_error": status == "failed"})
         del self._calls[identity]
 
-    def ended(self, answer: Mapping[str, Any]) -> None:
+    def ended(self, answer: Mapping[str, object]) -> None:
         """The answer to `session/prompt`."""
         self._whole()
         self.done = answer.get("stopReason") in _ENDED
@@ -135,11 +135,11 @@ class AcpReader(TurnReader):
             self.text = text
             self._entry("assistant", {"type": "text", "text": text})
 
-    def _entry(self, kind: str, block: dict[str, Any]) -> None:
+    def _entry(self, kind: str, block: dict[str, object]) -> None:
         self._entries.append({"type": kind, "message": {"role": kind, "content": [block]}})
 
 
-def _is_short(given: dict[str, Any]) -> bool:
+def _is_short(given: dict[str, object]) -> bool:
     try:
         return len(orjson.dumps(given)) <= _MAX_INPUT_BYTES
     except TypeError:  # nested too deeply
@@ -156,7 +156,7 @@ class Choice(NamedTuple):
     """The values that can be chosen, by themselves and by their names."""
 
 
-def offered_choice(answer: Mapping[str, Any], category: str) -> Choice | None:
+def offered_choice(answer: Mapping[str, object], category: str) -> Choice | None:
     """The setting of a category, such as `model`, in the answer that begins a session."""
     for option in mappings(answer.get("configOptions")):
         if category in (option.get("category"), option.get("id")):
@@ -168,7 +168,7 @@ def offered_choice(answer: Mapping[str, Any], category: str) -> Choice | None:
     return None
 
 
-def offered_modes(answer: Mapping[str, Any]) -> Choice | None:
+def offered_modes(answer: Mapping[str, object]) -> Choice | None:
     """The session's modes, which some agents list as one of the settings only."""
     modes = mapping(answer.get("modes"))
     if not modes:
@@ -185,7 +185,7 @@ def judges_itself(modes: Choice | None) -> bool:
     return modes is not None and modes.current == "auto" and MODE_THAT_ASKS in modes.values
 
 
-def usage_of(usage: Mapping[str, Any]) -> Usage:
+def usage_of(usage: Mapping[str, object]) -> Usage:
     """The paper's token counts from the protocol's `usage`, whose total shows whether the input includes cached
     tokens."""
     given, output, thought = (count(usage.get(f"{name}Tokens")) for name in ("input", "output", "thought"))
@@ -203,7 +203,7 @@ def usage_of(usage: Mapping[str, Any]) -> Usage:
     )
 
 
-def permission(request: Mapping[str, Any], workspace: PurePosixPath) -> dict[str, Any]:
+def permission(request: Mapping[str, object], workspace: PurePosixPath) -> dict[str, Any]:
     """The answer to `session/request_permission`: the jail confines an agent, so everything is allowed but to change
     what the rules protect, the feedback and `AGENTS.md`."""
     call = mapping(request.get("toolCall"))

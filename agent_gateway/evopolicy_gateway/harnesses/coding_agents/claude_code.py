@@ -16,7 +16,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
-from typing import Any
 
 from evopolicy_gateway.harnesses.coding_agents.dialect import (
     Dialect,
@@ -93,7 +92,7 @@ class ClaudeReader(TurnReader):
         super().__init__()
         self._messages: dict[str, Usage] = {}
 
-    def read_event(self, event: Mapping[str, Any]) -> None:
+    def read_event(self, event: Mapping[str, object]) -> None:
         kind = event.get("type")
         if kind == "system" and event.get("subtype") == "init":
             self.session = string(event.get("session_id")) or None
@@ -104,7 +103,7 @@ class ClaudeReader(TurnReader):
         elif kind == "result":
             self._result(event)
 
-    def _message(self, message: Mapping[str, Any]) -> None:
+    def _message(self, message: Mapping[str, object]) -> None:
         identity = string(message.get("id"))
         if identity:
             usage = usage_of(message, _TOKENS) or Usage()
@@ -116,7 +115,7 @@ class ClaudeReader(TurnReader):
         for block in mappings(message.get("content")):
             self._block(block)
 
-    def _block(self, block: Mapping[str, Any]) -> None:
+    def _block(self, block: Mapping[str, object]) -> None:
         if block.get("type") == "text":
             self.text = string(block.get("text"))
             self.action = first_line(self.text) or self.action
@@ -126,7 +125,7 @@ class ClaudeReader(TurnReader):
             target = string(given.get("file_path")) or string(given.get("pattern"))
             self.action = f"$ {first_line(command)}" if command else f"{string(block.get('name'))} {target}"
 
-    def _result(self, result: Mapping[str, Any]) -> None:
+    def _result(self, result: Mapping[str, object]) -> None:
         usage = usage_of(result, _TOKENS) or Usage()
         if usage.total >= self.usage.total:
             self.usage = usage

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from typing import Any
 
 from evopolicy_gateway.harnesses.coding_agents.dialect import (
     Dialect,
@@ -78,7 +77,7 @@ class Codex(Dialect):
 
 
 class CodexReader(TurnReader):
-    def read_event(self, event: Mapping[str, Any]) -> None:
+    def read_event(self, event: Mapping[str, object]) -> None:
         kind = event.get("type")
         if kind == "thread.started":
             self.session = string(event.get("thread_id")) or None
@@ -99,7 +98,7 @@ class CodexReader(TurnReader):
         elif not self.done:
             self.failure = turn_failure_of(message)
 
-    def _item(self, item: Mapping[str, Any], *, completed: bool) -> None:
+    def _item(self, item: Mapping[str, object], *, completed: bool) -> None:
         kind = item.get("type") or item.get("item_type")
         if kind in ("agent_message", "assistant_message"):
             if completed:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from typing import Any
 
 from evopolicy_common.errors import ConfigError
 from evopolicy_gateway.harnesses.coding_agents.dialect import Dialect, TurnReader, first_line, usage_of
@@ -79,7 +78,7 @@ class ConfiguredReader(TurnReader):
         super().__init__()
         self._events = events
 
-    def read_event(self, event: Mapping[str, Any]) -> None:
+    def read_event(self, event: Mapping[str, object]) -> None:
         self.session = _first(event, self._events.session) or self.session
         if text := _first(event, self._events.text):
             self.text, self.action = text, first_line(text)
@@ -92,7 +91,7 @@ class ConfiguredReader(TurnReader):
             self.usage = usage if paths.counts == "session" else self.usage + usage
 
 
-def _first(document: Mapping[str, Any], paths: tuple[str, ...]) -> str:
+def _first(document: Mapping[str, object], paths: tuple[str, ...]) -> str:
     texts = (value for path in paths for value in values(document, path) if isinstance(value, str) and value)
     return next(texts, "")
 

@@ -43,7 +43,7 @@ class TurnReader(ABC):
         """Number of retries by the CLI itself."""
 
     @abstractmethod
-    def read_event(self, event: Mapping[str, Any]) -> None:
+    def read_event(self, event: Mapping[str, object]) -> None:
         """Processes the next event; ignores unknown events."""
 
 
@@ -105,7 +105,7 @@ class Dialect(ABC):
         return match and match[0]
 
 
-def usage_of(event: Mapping[str, Any], paths: TokenPaths) -> Usage | None:
+def usage_of(event: Mapping[str, object], paths: TokenPaths) -> Usage | None:
     """The paper's token counts from an event of a stream, of which nothing is trusted; None without counts."""
     counts: dict[str, int] = {}
     for name in ("input", "cache_read", "cache_creation", "output", "reasoning", "total"):
@@ -124,17 +124,17 @@ def usage_of(event: Mapping[str, Any], paths: TokenPaths) -> Usage | None:
     )
 
 
-def mapping(value: Any) -> Mapping[str, Any]:
+def mapping(value: object) -> Mapping[str, Any]:
     """The value if it is an object, else an empty one: a stream's structure is not trusted."""
     return value if isinstance(value, dict) else {}
 
 
-def mappings(value: Any) -> list[Mapping[str, Any]]:
+def mappings(value: object) -> list[Mapping[str, Any]]:
     """The objects in a list; none if the value is no list."""
     return [each for each in value if isinstance(each, dict)] if isinstance(value, list) else []
 
 
-def string(value: Any) -> str:
+def string(value: object) -> str:
     return value if isinstance(value, str) else ""
 
 

@@ -87,7 +87,7 @@ class Reason(NamedTuple):
     about: dict[str, Any]
 
 
-def because(code: str, **about: Any) -> Reason:
+def because(code: str, **about: object) -> Reason:
     return Reason(code, about)
 
 

@@ -142,7 +142,7 @@ def _group(
     priority: int,
     stimulus_id: str,
     created_at: float | None = None,
-    **differing: Any,
+    **differing: object,
 ) -> JobGroup:
     """A group without jobs yet. `differing`: the fields of its template that are not the usual ones."""
     n = len(cases)

@@ -12,7 +12,7 @@ Rules that this module owns:
 from __future__ import annotations
 
 from collections import deque
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import msgspec
 
@@ -165,7 +165,7 @@ class Step:
         """Answer a request with the reason why it is not carried out."""
         self._out.append(Refuse(request=request, reason=reason))
 
-    def log(self, level: Literal["debug", "info", "warning", "error"], event: str, **fields: Any) -> None:
+    def log(self, level: Literal["debug", "info", "warning", "error"], event: str, **fields: object) -> None:
         self._out.append(Log(level=level, event=event, fields=fields, stimulus_id=self.stimulus_id))
 
     def effects(self) -> list[Effect]:

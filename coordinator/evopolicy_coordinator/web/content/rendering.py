@@ -103,7 +103,7 @@ class Words(msgspec.Struct, frozen=True, kw_only=True):
     before: int | None = None
     """Of a log: only what stands before that place."""
 
-    def link(self, **changed: Any) -> str:
+    def link(self, **changed: object) -> str:
         """The query of the same page with other words."""
         query = {"q": self.q, "page": self.page, "before": self.before, **changed}
         return "?" + urlencode({name: value for name, value in query.items() if value})

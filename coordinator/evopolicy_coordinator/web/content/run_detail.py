@@ -255,13 +255,13 @@ def _as_text(data: bytes) -> str | None:
     return None
 
 
-def _reward(row: dict[str, Any]) -> float:
+def _reward(row: dict[str, object]) -> float:
     # Others wrote it: an integer may be too large for a float.
     reward = row.get("reward")
     return float(reward) if isinstance(reward, int | float) and abs(reward) <= LARGEST else float("nan")
 
 
-def _series(columns: Any, n: int, name: str) -> tuple[list[Line], str]:
+def _series(columns: object, n: int, name: str) -> tuple[list[Line], str]:
     """Lines of those values that are numeric with one length; and a note if some are left out."""
     if columns is None:
         return [], ""
@@ -326,7 +326,7 @@ def _told(part: Part) -> Iterator[tuple[str, str, str]]:
         yield "ended", title, _plain(next((part.value[name] for name in fields if part.value.get(name)), ""))
 
 
-def _plain(value: Any) -> str:
+def _plain(value: object) -> str:
     """A tool's input or output as text: strings as they are, one name a line."""
     if isinstance(value, str):
         return value
@@ -356,7 +356,7 @@ _EVENTS = {
 """Frequent events in words, by their names in the log."""
 
 
-def _event(entry: dict[str, Any]) -> Happened:
+def _event(entry: dict[str, object]) -> Happened:
     name = str(entry.get("event", ""))[:1000]
     values = {
         each: _cut(_plain(value))[:500]

@@ -209,7 +209,7 @@ def submit_values(run: RunFacts, reader: Reader, index: int) -> dict[str, Any]:
     }
 
 
-def _numbers(value: Any) -> list[float | None]:
+def _numbers(value: object) -> list[float | None]:
     values = value if isinstance(value, list) else []
     return [each if isinstance(each, int | float) else None for each in values]
 
