@@ -58,11 +58,19 @@ KINDS = {
 """Words of a process's program, and of its command line."""
 ZYGOTE_DEPTH = 2 if os.geteuid() == 0 else 0
 Site = Literal[
-    "one host", "two hosts", "relay", "clock that jumps", "bad disks", "two coordinators", "object store"
+    "one host",
+    "two hosts",
+    "relay",
+    "clock that jumps",
+    "bad disks",
+    "two coordinators",
+    "leader on a machine of its own",
+    "object store",
 ]
 """One host: worker and coordinator by a unix socket that `WeakLink` passes on. Two hosts: by TCP over a cable. Relay:
 all by TCP that `WeakLink` passes on, gateways and commands too. Two coordinators: on one PostgreSQL database, and all
-know both by TCP. Object store: one host, whose coordinator has its blobs in an S3 service."""
+know both by TCP; the first one may be on a machine of its own, at the end of a cable. Object store: one host, whose
+coordinator has its blobs in an S3 service."""
 
 AGENT = '''
 import http.client, json, os, pathlib, sys, time, urllib.error, urllib.request
@@ -186,28 +194,34 @@ class FaultCluster:
         self.disks = Disks(root, (self.state, self.runs)) if site == "bad disks" else None
         if self.disks is not None:
             self._environment |= self.disks.environment
-        self.cable = Cable() if site == "two hosts" else None
+        apart = site == "leader on a machine of its own"
+        self.cable = Cable() if site == "two hosts" or apart else None
         if self.cable is not None:
             stack.callback(self.cable.close)
         self._ready = root / "ready.json"
         launcher = Path(__file__).with_name("fixed_coordinator.py")
         coordinator = [sys.executable, str(launcher), str(self.state), str(self._ready)]
-        if self.cable is not None or site == "relay":
+        if site in ("two hosts", "relay"):
             # Of a network namespace of our own, so the port is free, and the same when it is started again.
             coordinator.append(f"tcp/{Cable.NEAR if self.cable is not None else '127.0.0.1'}:{PORT}")
         self.server: Server | None = None
         self.standby: Kept | None = None
         more: dict[str, str] = {}
-        if site == "two coordinators":
-            self.server = Server()
+        if site == "two coordinators" or apart:
+            self.server = Server(net=f"{Cable.FAR}/32" if apart else "")
             stack.callback(self.server.close)
             self.database = self.server.new()
             key = root / "seal-key"
             key.touch(mode=0o600)
             key.write_bytes(Fernet.generate_key())
             self._environment |= {"PGPASSFILE": str(self.server.passfile), "FAULTS_SEAL_KEY": str(key)}
-            coordinator.append(f"tcp/127.0.0.1:{PORT}")
-            more = {"FAULTS_STORE": f"{self.database}?application_name=first"}
+            near, far = (Cable.NEAR, Cable.FAR) if apart else ("127.0.0.1", "127.0.0.1")
+            coordinator.append(f"tcp/{far}:{PORT}")
+            # A folder that both machines mount.
+            self._environment |= {"FAULTS_BLOBS": str(root / "blobs")}
+            more = {"FAULTS_STORE": f"{self.database.replace('127.0.0.1', near)}?application_name=first"}
+            if self.cable is not None:
+                coordinator = [*self.cable.at_its_far_end, *coordinator]
         self.objects: ObjectStore | None = None
         if site == "object store":
             from machines.seaweedfs import ObjectStore
@@ -227,13 +241,12 @@ class FaultCluster:
         if self.server is not None:
             other = root / "standby"
             other.mkdir(mode=0o700)
-            (other / "blobs").symlink_to(self.state / "blobs")
             program = [sys.executable, str(launcher), str(other), str(root / "standby.json")]
             program.append(f"tcp/127.0.0.1:{PORT + 1}")
             more = {"FAULTS_STORE": f"{self.database}?application_name=second"}
             self.standby = Kept(program, root / "standby.log", self._environment | more)
             stack.callback(self.standby.end)
-            self._reach(f"tcp/127.0.0.1:{PORT}", f"tcp/127.0.0.1:{PORT + 1}")
+            self._reach(f"tcp/{far}:{PORT}", f"tcp/127.0.0.1:{PORT + 1}")
         if site == "relay":
             port = int(ready["endpoints"][-1].rpartition(":")[2])
             self.link = WeakLink(("127.0.0.1", 0), ("127.0.0.1", port))
@@ -242,7 +255,7 @@ class FaultCluster:
         worker = [sys.executable, str(launcher.with_name("fixed_worker.py"))]
         worker += ["--env", "toy/*", "--slots", "2", "--need-tier", "bwrap"]
         worker += ["--grace", "1", "--credentials", self.files["worker"]]
-        if self.cable is not None:
+        if self.cable is not None and not apart:
             worker = [*self.cable.at_its_far_end, *worker, "--connect", ready["endpoints"][-1]]
         elif self.link is None and self.server is None:
             self.link = WeakLink(root / "link.sock", self.state / "coordinator.sock")
@@ -292,12 +305,42 @@ class FaultCluster:
         """The coordinator is killed, its state lost, and another one started on the backup."""
 
         def replace() -> None:
-            for path in self.state.iterdir():
-                shutil.rmtree(path) if path.is_dir() else path.unlink()
+            self._lose_disk()
             shutil.copytree(backup, self.state, dirs_exist_ok=True)
             self.state.chmod(0o700)
 
         self.coordinator.replaced(replace)
+
+    def _lose_disk(self) -> None:
+        for path in self.state.iterdir():
+            shutil.rmtree(path) if path.is_dir() else path.unlink()
+
+    def lose_machine(self) -> float:
+        """The first coordinator's machine is lost: network, process, and disk at once. When the standby leads, a new
+        machine with an empty disk comes instead, and takes the lead later. Returns the seconds without a leader."""
+        assert self.cable is not None
+        assert self.standby is not None
+        cable, without_s = self.cable, 0.0
+        deadline = time.monotonic() + TIMEOUT_S
+        while self.leader() is not self.coordinator:
+            assert time.monotonic() < deadline
+            time.sleep(0.05)
+        lost_at = time.monotonic()
+
+        def replace() -> None:
+            nonlocal without_s
+            self._lose_disk()
+            while not self._lead().get("second"):
+                assert time.monotonic() < lost_at + TIMEOUT_S
+                time.sleep(0.05)
+            without_s = time.monotonic() - lost_at
+            cable.far_end("up")
+
+        cable.far_end("down")
+        self.coordinator.replaced(replace)
+        assert self.leader() is self.standby
+        os.kill(self.standby.process.pid, signal.SIGKILL)
+        return without_s
 
     def operator_command(
         self, arguments: list[str], stderr: int | IO[str] = subprocess.PIPE
@@ -348,14 +391,18 @@ class FaultCluster:
 
     def leader(self) -> Kept | None:
         """Of two coordinators on one database, the one that leads, once the other one waits."""
+        deadline = time.monotonic() + TIMEOUT_S
+        while sorted((known := self._lead()).values()) != [False, True]:
+            assert time.monotonic() < deadline, known
+            time.sleep(0.05)
+        return self.coordinator if known["first"] else self.standby
+
+    def _lead(self) -> dict[str, bool]:
+        """Whether each of the coordinators on the database leads."""
         assert self.server is not None
         address = f"{self.database}?passfile={self.server.passfile}"
         with contextlib.closing(connect_to_database(address, "ro", 10.0)) as db:
-            deadline = time.monotonic() + TIMEOUT_S
-            while sorted((known := dict(db.coordinators())).values()) != [False, True]:
-                assert time.monotonic() < deadline, known
-                time.sleep(0.05)
-        return self.coordinator if known["first"] else self.standby
+            return dict(db.coordinators())
 
     def strays(self) -> list[str]:
         """What lives below this process beside the coordinator, the worker and what the worker's slots need."""

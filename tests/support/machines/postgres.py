@@ -33,9 +33,9 @@ def programs() -> Path | None:
 class Server:
     """A started server. Its password is in the file that `PGPASSFILE` names."""
 
-    def __init__(self, *, durable: bool = False, follows: Server | None = None) -> None:
+    def __init__(self, *, durable: bool = False, follows: Server | None = None, net: str = "") -> None:
         """`durable`: it waits for the disk. `follows`: it has that one's rows by streaming replication, and each commit
-        there waits until they can be read here."""
+        there waits until they can be read here. `net`: it also serves clients of this network, as `10.0.0.0/24`."""
         bin_ = programs()
         if bin_ is None:
             pytest.skip("needs a PostgreSQL server: make test-cluster as root, or apt-get install postgresql")
@@ -49,7 +49,7 @@ class Server:
         with socket.socket() as probe:
             probe.bind(("127.0.0.1", 0))
             self.port = probe.getsockname()[1]
-        self._durable = durable
+        self._durable, self._listen = durable, "*" if net else "127.0.0.1"
         self.password = secrets.token_hex(8) if follows is None else follows.password
         password = self.root / "password"
         password.write_text(self.password)
@@ -67,11 +67,13 @@ class Server:
                 "--locale=C.UTF-8",
             )
             self._run("initdb", *data, *how)
+            with (self.root / "data" / "pg_hba.conf").open("a") as rules:
+                rules.write(f"host all all {net} scram-sha-256\n" if net else "")
         else:
             link = f"host=127.0.0.1 port={follows.port} user=evopolicy password={self.password}"
             self._run("pg_basebackup", *data, "--checkpoint=fast", "--write-recovery-conf", "-d", link)
         self.passfile = self.root.with_name(f"{self.root.name}.pass")
-        self.passfile.write_text(f"127.0.0.1:{self.port}:*:evopolicy:{self.password}\n")
+        self.passfile.write_text(f"*:{self.port}:*:evopolicy:{self.password}\n")
         self.passfile.chmod(0o600)
         self._n = 0
         self.start()
@@ -91,7 +93,7 @@ class Server:
         with (self.root.with_name(f"{self.root.name}.log")).open("ab") as log:
             self.process = subprocess.Popen(
                 [self._programs / "postgres", "-D", self.root / "data", "-p", str(self.port),
-                 "-h", "127.0.0.1", "-k", self.root, *fast],
+                 "-h", self._listen, "-k", self.root, *fast],
                 stdout=log, stderr=log, cwd="/", **self._owner,
             )  # fmt: skip
         deadline = time.monotonic() + _TIMEOUT_S
