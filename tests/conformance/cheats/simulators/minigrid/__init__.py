@@ -49,7 +49,8 @@ def read_memory() -> str:
     buffer = ctypes.create_string_buffer(8)
     local = struct.pack("<QQ", ctypes.addressof(buffer), 8)
     remote = struct.pack("<QQ", T["address"], 8)
-    check(libc.syscall(270 if ARM else 310, T["supervisor"], local, 1, remote, 1, 0))
+    # The last argument is passed in memory, of which ctypes sets 32 bits for an int.
+    check(libc.syscall(270 if ARM else 310, T["supervisor"], local, 1, remote, 1, ctypes.c_ulong(0)))
     return buffer.raw.decode()
 
 
