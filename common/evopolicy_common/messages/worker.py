@@ -256,6 +256,8 @@ class BlobGet(Message, frozen=True, kw_only=True, tag="blob_get"):
     token: Word
     digest: Word
     offset: Int
+    direct: bool = False
+    """Whether an address may be answered instead of the first chunk."""
 
 
 class BlobChunk(Message, frozen=True, kw_only=True, tag="blob_chunk"):
@@ -263,6 +265,8 @@ class BlobChunk(Message, frozen=True, kw_only=True, tag="blob_chunk"):
 
     size: Int
     data: Bytes
+    address: Text = ""
+    """Where an object store serves the whole blob, and nothing else, for a minute; then without data."""
 
 
 WorkerRequest = Register | LeaseRequest | Heartbeat | ReportResults | BlobPut | BlobGet

@@ -7,13 +7,16 @@ caller's timeout passes. A refusal counts as a reply.
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import hashlib
 import io
 import random
 import time
 from collections.abc import Callable, Collection
 from functools import partial
+from http.client import HTTPConnection, HTTPException, HTTPSConnection
 from typing import IO, Generic, TypeVar
+from urllib.parse import urlsplit
 
 import msgspec
 
@@ -37,6 +40,10 @@ LONGEST_PAUSE_S = 0.5
 """Clients resume within a second of the coordinator's return."""
 ANSWER_S = 5.0
 """Timeout of one sending, beyond the time that a long poll requests."""
+OUT_OF_REACH_S = 300.0
+"""After a failure of the object store, its blobs come through the coordinator for this long."""
+DIRECT_S = 60.0
+"""Timeout of a blob from the object store."""
 WARN_AFTER_S = 10.0
 """A request that has waited this long is logged, and again whenever its waiting time has doubled."""
 
@@ -49,6 +56,8 @@ class Requester(Generic[Reply]):
     ) -> None:
         """`key_of` maps a verb (`lease`, `submit`) to the full key; `replies` decodes this kind of client's replies."""
         self._link, self._key_of, self._replies = link, key_of, replies
+        self._direct_at = 0.0
+        """When the object store may be asked again, by the monotonic clock."""
 
     async def once(self, verb: str, message: Message, wanted: type[Wanted], *, wait_s: float = 0.0) -> Wanted:
         """Sends the message once and returns the reply.
@@ -118,12 +127,20 @@ class Requester(Generic[Reply]):
         self, file: IO[bytes], sender: str, token: str, digest: str, most: int = codec.MAX_BLOB_BYTES
     ) -> None:
         """Writes a blob to a file. Raises ProtocolError for more than `most` bytes, or another digest."""
-        hashed, have = hashlib.sha256(), 0
+        hashed, have, direct = hashlib.sha256(), 0, time.monotonic() >= self._direct_at
         while True:
-            get = BlobGet(sender=sender, token=token, digest=digest, offset=have)
+            get = BlobGet(sender=sender, token=token, digest=digest, offset=have, direct=direct and not have)
             chunk = await self.until_answered("blob", get, BlobChunk)
             if chunk.size > most:
                 raise ProtocolError(f"blob {digest} of {chunk.size:,} bytes; {most:,} are the limit")
+            if chunk.address and direct and not have:
+                data = await asyncio.to_thread(_fetched, chunk.address, chunk.size)
+                if digest_of(data) != digest:
+                    why = "the object store did not send a blob; asking the coordinator instead"
+                    log.warning(why, digest=digest, size=chunk.size, received=len(data), for_s=OUT_OF_REACH_S)
+                    direct, self._direct_at = False, time.monotonic() + OUT_OF_REACH_S
+                    continue
+                chunk = BlobChunk(size=len(data), data=data)
             file.write(chunk.data)
             hashed.update(chunk.data)
             have += len(chunk.data)
@@ -139,6 +156,23 @@ class Requester(Generic[Reply]):
         if digest_of(ref.inline) != ref.digest:
             raise ProtocolError(f"blob {ref.digest} arrived damaged inside its message")
         return ref.inline
+
+
+def _fetched(address: str, size: int) -> bytes:
+    """Returns at most `size` bytes of an object by its signed address; fewer when they do not come. Follows no
+    redirect, and does not log the address: whoever knows it can read the object."""
+    data, deadline = bytearray(), time.monotonic() + DIRECT_S
+    with contextlib.suppress(OSError, HTTPException, ValueError, KeyError):
+        parts = urlsplit(address)
+        connection = {"http": HTTPConnection, "https": HTTPSConnection}[parts.scheme]
+        with contextlib.closing(connection(parts.netloc, timeout=ANSWER_S)) as link:
+            link.request("GET", f"{parts.path}?{parts.query}")
+            answer = link.getresponse()
+            while answer.status == 200 and time.monotonic() < deadline:
+                if not (piece := answer.read1(size - len(data))):
+                    break
+                data += piece
+    return bytes(data)
 
 
 def operator_requests(link: Link) -> Requester[OperatorReply]:

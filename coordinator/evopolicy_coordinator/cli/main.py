@@ -84,6 +84,14 @@ def serve(
             " come from environment variables) or another folder. Default: as the state folder says.",
         ),
     ] = None,
+    direct_blobs: Annotated[
+        bool,
+        typer.Option(
+            "--direct-blobs",
+            help="Let workers and gateways read blobs from the object store, by addresses that name one blob each and"
+            " end after a minute. Without it, and where they cannot reach it, the coordinator sends them.",
+        ),
+    ] = False,
     data: Annotated[
         Path | None,
         typer.Option(
@@ -175,6 +183,7 @@ def serve(
         store=store,
         seal_key=seal_key,
         blobs=blobs,
+        direct_blobs=direct_blobs,
         listen=tuple(listen or ()),
         insecure_tcp=insecure_tcp,
         allowed_packages=checked_names(policy_package),

@@ -72,6 +72,8 @@ class Options(msgspec.Struct, frozen=True, kw_only=True):
     """File with the key that seals the secrets in the database; None: they are not shared."""
     blobs: str | None = None
     """Address of an object store, or a folder; None: as the state folder says, else its own."""
+    direct_blobs: bool = False
+    """Whether workers and gateways read from the object store."""
     listen: tuple[str, ...] = ()
     """Endpoints besides the unix socket in the state folder; port 0 picks a free port."""
     insecure_tcp: bool = False
@@ -190,7 +192,7 @@ async def _lead(
             store.forget_kernels(ended)
         for name in ended:
             (state.root / credentials.WORKERS / name).unlink()
-        blobs = blobs_of(state.root, place, where, lambda: store.incarnation)
+        blobs = blobs_of(state.root, place, where, lambda: store.incarnation, direct=options.direct_blobs)
         if isinstance(blobs, ObjectBlobs) and where != place_of(state.root, BLOBS):
             await asyncio.to_thread(blobs.claim, state.identity.operator_token)
         record_place(state.root, BLOBS, where)

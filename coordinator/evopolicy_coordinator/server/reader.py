@@ -315,6 +315,8 @@ class ServiceReader:
         known = is_digest(message.digest) and (run is None or self._reader.names_blob(run, message.digest))
         text = f"no blob {message.digest[:80]!r} here"
         require(known and self.blobs.has(message.digest), Refusal.UNKNOWN_BLOB, text)
+        if message.direct and message.offset == 0 and (address := self.blobs.address(message.digest)):
+            return BlobChunk(size=self.blobs.size(message.digest), data=b"", address=address)
         data = self.blobs.read_chunk(message.digest, max(0, message.offset), codec.CHUNK_BYTES)
         return BlobChunk(size=self.blobs.size(message.digest), data=data)
 

@@ -38,6 +38,7 @@ from evopolicy_coordinator.storage.store import CONDEMNED, NAMED
 COPIES = "blob-copies"
 COPIES_BYTES = 1 << 30
 """Most bytes of copies in that folder of a state folder."""
+ADDRESS_LIFE = timedelta(seconds=60)
 _OWNER = "evopolicy-owner"
 _NAME = re.compile(r"[0-9a-f]{2}/[0-9a-f]{64}-(\d+)-[0-9a-f]{8}")
 _PIECE = 8 << 20
@@ -51,6 +52,8 @@ class ObjectBlobs(BlobStore):
     """Blobs in an object store. Thread-safe."""
 
     remote = True
+    direct = False
+    """Whether workers and gateways get addresses of objects."""
 
     def __init__(
         self, folder: Path, address: str, place: Place, incarnation: Callable[[], int] | None = None
@@ -106,6 +109,13 @@ class ObjectBlobs(BlobStore):
             finally:
                 part.unlink(missing_ok=True)
         return super().read_chunk(digest, offset, n)
+
+    def address(self, digest: str) -> str:
+        if not self.direct:
+            return ""
+        name, _ = self._known(digest)
+        with self._asking("sign an address"):
+            return str(self._client.sign(self._objects, "GET", name, ADDRESS_LIFE))
 
     def drop_unfinished(self, sender: str | None = None) -> None:
         super().drop_unfinished(sender)
@@ -296,10 +306,20 @@ def checked_blobs(named: str) -> Place:
 
 
 def blobs_of(
-    root: Path, place: Place, where: Place | None = None, incarnation: Callable[[], int] | None = None
+    root: Path,
+    place: Place,
+    where: Place | None = None,
+    incarnation: Callable[[], int] | None = None,
+    *,
+    direct: bool = False,
 ) -> BlobStore:
-    """The blobs of a state folder whose rows are at `place`. `where`: None for where they are recorded to be."""
+    """The blobs of a state folder whose rows are at `place`. `where`: None for where they are recorded to be. `direct`:
+    others read from the object store. Raises ConfigError."""
     where = where or place_of(root, BLOBS)
     if isinstance(where, Path):
+        if direct:
+            raise ConfigError("--direct-blobs: the blobs are in a folder; name an object store with --blobs")
         return BlobStore(where)
-    return ObjectBlobs(root / COPIES, where, place, incarnation)
+    blobs = ObjectBlobs(root / COPIES, where, place, incarnation)
+    blobs.direct = direct
+    return blobs

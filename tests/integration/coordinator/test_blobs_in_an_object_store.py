@@ -11,6 +11,7 @@ from typing import Any
 
 import msgspec
 import pytest
+from commands import worker_of
 from coordinator_harness import (
     Coordinator,
     bundle_of,
@@ -132,6 +133,64 @@ def test_a_run_survives_the_loss_of_the_object_store_and_a_move(
     for path in state.rglob("*"):
         assert not path.is_file() or secret not in path.read_bytes(), path
     assert secret not in coordinator.log.read_bytes()
+
+
+PEEKING = """
+import os, pathlib
+class Policy:
+    def __init__(self, obs_space, action_space, env_meta): pass
+    def reset(self, episode_index):
+        print(dict(os.environ))
+        for path in (pathlib.Path("/proc/self/cmdline"), *pathlib.Path(__file__).parent.rglob("*")):
+            try:
+                print(path.read_text())
+            except OSError as error:
+                print(error)
+    def act(self, obs): return 1
+"""
+
+
+def test_workers_and_gateways_read_from_the_object_store(tmp_path: Path, object_store: ObjectStore) -> None:
+    """With `--direct-blobs` the coordinator sends no bytes of blobs that it has no copy of. Attack: a policy looks for
+    the address in all that it can read; neither it nor a log or file has one."""
+    state = tmp_path / "state"
+    coordinator, peeked = (
+        Coordinator(folder, "--blobs", object_store.new(), "--direct-blobs")
+        for folder in (state, tmp_path / "peeked")
+    )
+
+    async def scenario() -> None:
+        async with operator_of(coordinator) as operator:
+            created = await operator.create()
+            await submit(coordinator, created, 0)
+            await asyncio.to_thread(shutil.rmtree, state / "blob-copies")
+            (state / "blob-copies" / "parts").mkdir(parents=True)
+            async with gateway_of(coordinator, created) as gateway:
+                found = await gateway.ask.download(gateway.run, gateway.token, digest_of(RECORDING))
+                assert found == RECORDING
+            assert [path for path in (state / "blob-copies").rglob("*") if path.is_file()] == []
+            assert await operator.ask.download("operator", operator.token, digest_of(RECORDING)) == RECORDING
+
+    async def real() -> None:
+        with worker_of(peeked, "--env", "toy/line"):
+            async with operator_of(peeked) as operator:
+                created = await operator.create()
+                async with gateway_of(peeked, created) as gateway:
+                    await gateway.submit(bundle_of(PEEKING), (0, 1), "peeks")
+                    episodes, done = await gateway.results(0)
+                    assert (done.status, {episode.index for episode in episodes}) == ("ok", {0, 1})
+                    printed = b"".join(episode.stdout for episode in episodes)
+                    assert b"class Policy" in printed, episodes
+                    assert b"X-Amz" not in printed
+
+    try:
+        run(scenario, 120)
+        run(real, 120)
+    finally:
+        coordinator.kill()
+        peeked.kill()
+    for path in tmp_path.rglob("*"):
+        assert not path.is_file() or b"X-Amz" not in path.read_bytes(), path
 
 
 def test_two_coordinators_share_the_object_store(

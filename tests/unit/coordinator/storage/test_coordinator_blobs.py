@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import os
+import re
 import threading
+import time
 from collections.abc import Iterator
+from datetime import timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import httpx
 import pytest
 from rigs.store_rows import blob, outcome_row, run_row, state_row, submit_row
 
@@ -349,6 +353,40 @@ def test_denied_access_and_a_full_store_have_reasons(
     assert remote.opened().read_chunk(DIGEST, 0, 99) == DATA
     remote.blobs.put(b"while it is full")
     assert remote.blobs.trouble == ""
+
+
+@pytest.mark.cluster
+def test_an_address_serves_one_blob_for_a_while(remote: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Attack: a worker uses the address of a blob that it may read for another blob, to write or delete, and later."""
+    other = remote.blobs.put(b"the bundle of another run")
+    remote.blobs.put(DATA)
+    assert isinstance(remote.blobs, ObjectBlobs)
+    assert remote.blobs.address(DIGEST) == ""
+    remote.blobs.direct = True
+    address = remote.blobs.address(DIGEST)
+    assert httpx.get(address).content == DATA
+    ((theirs,),) = remote.sql(f"SELECT name FROM objects WHERE digest = '{other}'")
+    ((ours,),) = remote.sql(f"SELECT name FROM objects WHERE digest = '{DIGEST}'")
+    attacks = [
+        httpx.get(address.replace(str(ours), str(theirs))),
+        httpx.get(address.partition(str(ours)[:2] + "/")[0] + "?" + address.partition("?")[2]),
+        httpx.put(address, content=b"evil"),
+        httpx.delete(address),
+        httpx.get(re.sub(r"Expires=\d+", "Expires=604800", address)),
+    ]
+    assert [each.status_code for each in attacks] == [403] * len(attacks)
+    monkeypatch.setattr(objects, "ADDRESS_LIFE", timedelta(seconds=1))
+    short = remote.blobs.address(DIGEST)
+    time.sleep(2.5)
+    assert httpx.get(short).status_code == 403
+    assert httpx.get(address).content == DATA
+    with pytest.raises(StorageError):
+        remote.blobs.address(digest_of(b"not stored"))
+
+
+def test_direct_blobs_need_an_object_store(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="name an object store"):
+        blobs_of(tmp_path, tmp_path / DATABASE, tmp_path / "blobs", direct=True)
 
 
 @pytest.mark.cluster
