@@ -67,6 +67,13 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
     warning: str | None = None
     """How the policy failed; missing if it did not."""
 
+    @property
+    def brief(self) -> Summary:
+        """Without its long fields by episode."""
+        return msgspec.structs.replace(self, **dict.fromkeys(_BY_EPISODE))
+
+
+_BY_EPISODE = ("env_instances", "returns", "episode_lengths", "reward_components_per_episode", "successes")
 
 _decoder = msgspec.json.Decoder(Summary)
 

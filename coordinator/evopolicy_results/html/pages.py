@@ -9,7 +9,6 @@ from typing import Any, NamedTuple
 
 from markupsafe import Markup, escape
 
-from evopolicy_common.records.policies.submits import read_submits
 from evopolicy_common.records.run_record import Replay
 from evopolicy_common.records.words import in_words
 from evopolicy_common.terminal import number
@@ -198,9 +197,6 @@ def trace_page(
     used = run.submits[-1].consumed if run.submits else 0
     rows = submit_rows(
         run.submits,
-        {one.index: one.summary for one in read_submits(run.path, record.artifacts)}
-        if not run.is_published
-        else {},
         traced={row.submit.index: row for row in trace.rows},
         folder=run.path,
         selected=best,

@@ -6,7 +6,6 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import msgspec
 from markupsafe import Markup
@@ -29,8 +28,6 @@ MAX_SUBMITS = 200
 
 class SubmitRow(msgspec.Struct, frozen=True, kw_only=True):
     submit: Submit
-    summary: Any
-    """Its summary, the published software's too; None without one."""
     is_best: bool
     """Whether no other submit has a higher mean train return; one submit at most."""
     is_selected: bool
@@ -49,7 +46,6 @@ class SubmitRow(msgspec.Struct, frozen=True, kw_only=True):
 
 def submit_rows(
     submits: Sequence[Submit],
-    summaries: Mapping[int, object],
     *,
     traced: Mapping[int, TraceRow] | None = None,
     folder: Path | None = None,
@@ -76,7 +72,6 @@ def submit_rows(
         rows.append(
             SubmitRow(
                 submit=submit,
-                summary=summaries.get(index),
                 is_best=index == best,
                 is_selected=may_show and index == selected,
                 outcome=_outcome(row, by_index) if row is not None and may_show else "",

@@ -32,6 +32,7 @@ from evopolicy_common.records.run_record import (
     decode_run_record,
 )
 from evopolicy_common.records.splits import SPLITS
+from evopolicy_common.records.summary import Summary
 from evopolicy_common.regular_files import read_regular
 from evopolicy_results.code.sources import n_changed, reachable_modules, read_python_files, source_digest
 from evopolicy_results.code.topology import describe
@@ -220,6 +221,7 @@ def _read_submits(folder: Path, record: RunRecord) -> tuple[Submit, ...]:
                 bundle_digest=_bundle_digest(meta, checkpoint) if status == "ok" else "",
                 source=source,
                 changed_lines=changed,
+                summary=summary.brief if isinstance(summary, Summary) else None,
             )
         )
     return tuple(submits)

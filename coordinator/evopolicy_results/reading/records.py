@@ -15,6 +15,7 @@ import msgspec
 
 from evopolicy_common.records.rescores import RescoreRecord
 from evopolicy_common.records.run_record import RunRecord
+from evopolicy_common.records.summary import Summary
 from evopolicy_results.code.topology import Features
 from evopolicy_results.reading.environments import by_name, grouped, ordered_environments
 from evopolicy_results.reading.published import PUBLISHED
@@ -57,6 +58,8 @@ class Submit(msgspec.Struct, frozen=True, kw_only=True):
     """None when there is no readable checkpoint."""
     changed_lines: int | None = None
     """Lines added plus removed in the source bundle since the previous ok submit; None for the first, or if unknown."""
+    summary: Summary | None = None
+    """Without its fields by episode, of which a run has thousands; None without one, and of the published software."""
 
     @property
     def label(self) -> str:

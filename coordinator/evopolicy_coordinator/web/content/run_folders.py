@@ -14,7 +14,7 @@ import time
 from collections.abc import Iterable, Mapping, Sequence
 from datetime import datetime
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, TypeVar
 
 import msgspec
 
@@ -31,25 +31,13 @@ from evopolicy_common.records.summary import Summary
 from evopolicy_common.regular_files import read_regular
 from evopolicy_results.reading.environments import learn_names
 from evopolicy_results.reading.reader import find_run_dirs
+from evopolicy_results.reading.records import Submit
 
 T = TypeVar("T")
 
 _MAX_SUMMARY_BYTES = 8 << 20
 _TOKENS = ("input_noncached", "cache_read", "cache_creation", "output")
 _FROM_SETTINGS = ("entry", "env", "exp_id", "repeat", "budget", "hidden_cases", "start", "replay_of")
-_BY_EPISODE = ("env_instances", "returns", "episode_lengths", "reward_components_per_episode", "successes")
-
-
-class Submit(NamedTuple):
-    summary: Summary
-    """Without its fields by episode, which are read again for its page: a run has thousands of episodes."""
-    consumed: int
-    """Episodes charged up to its end."""
-
-    @property
-    def mean(self) -> float | None:
-        """Mean train return; None unless it is ok."""
-        return self.summary.mean_return if self.summary.status == "ok" else None
 
 
 class RunFacts(msgspec.Struct, frozen=True, kw_only=True):
@@ -225,10 +213,23 @@ class Reader:
         for one in read_submits(folder, names=MAX_NAMES, size=_MAX_SUMMARY_BYTES):
             with contextlib.suppress(ProtocolError):
                 if one.index not in known and one.summary is not None:
-                    known[one.index] = msgspec.structs.replace(one.summary, **dict.fromkeys(_BY_EPISODE))
+                    known[one.index] = one.summary.brief
         summaries = sorted(known.values(), key=lambda each: each.submit_index)
         consumed = itertools.accumulate(each.n_episodes for each in summaries)
-        return list(map(Submit, summaries, consumed))
+        return [
+            Submit(
+                index=one.submit_index,
+                status=one.status,
+                n_episodes=one.n_episodes,
+                consumed_before=until - one.n_episodes,
+                consumed=until,
+                mean_return=one.mean_return if one.status == "ok" else None,
+                n_failed_episodes=len(one.errors or ()),
+                started_at=one.submit_started_at,
+                summary=one,
+            )
+            for one, until in zip(summaries, consumed, strict=True)
+        ]
 
     def _open(self, folder: Path, entry: SweepRun | None, by_run: Mapping[str, RunStatus]) -> RunFacts:
         intended = _decoded(folder, open_run.INTENDED, IntendedRun)
@@ -245,9 +246,9 @@ class Reader:
         if intended is not None:
             facts |= {name: getattr(intended.settings, name) for name in _FROM_SETTINGS}
         if submits:
-            last = submits[-1]
-            facts |= {"used": last.consumed, "n_submits": len(submits), "best": _best(submits)}
-            facts["budget"] = facts["budget"] or last.consumed + last.summary.remaining_budget
+            used, last = submits[-1].consumed, submits[-1].summary
+            facts |= {"used": used, "n_submits": len(submits), "best": _best(submits)}
+            facts["budget"] = facts["budget"] or (last and used + last.remaining_budget)
         if status is not None:
             told = _of_status(status)
             facts |= {name: told[name] for name in ("state", "budget", "waits_for", "running", "queued")}
@@ -263,7 +264,7 @@ class Reader:
 
 
 def _best(submits: Iterable[Submit]) -> float | None:
-    return max((one.mean for one in submits if one.mean is not None), default=None)
+    return max((one.mean_return for one in submits if one.mean_return is not None), default=None)
 
 
 def _placed(folder: Path) -> dict[str, Any]:

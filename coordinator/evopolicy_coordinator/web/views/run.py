@@ -14,19 +14,18 @@ from markupsafe import Markup
 from evopolicy_common.confined import NotThereError
 from evopolicy_common.messages.status import RetriedJobs
 from evopolicy_common.records import model_calls
-from evopolicy_common.records.policies.submits import read_submits
 from evopolicy_common.records.policies.trees import changes
 from evopolicy_common.records.summary import utc_text
 from evopolicy_common.terminal import counted, duration, number
 from evopolicy_coordinator.web.content.rendering import Words, ident, part, short, state_words
 from evopolicy_coordinator.web.content.run_detail import IMAGES, MAX_WORDS, CodeFile, Detail, Happened
-from evopolicy_coordinator.web.content.run_folders import Reader, RunFacts, Runs, Submit
+from evopolicy_coordinator.web.content.run_folders import Reader, RunFacts, Runs
 from evopolicy_results.behaviour.trace import Trace, diff, trace
 from evopolicy_results.figures.line_chart import chart
 from evopolicy_results.html import View, notice
 from evopolicy_results.html.run_page import SubmitRow, run_view, submit_rows
 from evopolicy_results.reading.reader import read_run
-from evopolicy_results.reading.records import Submit as Shown
+from evopolicy_results.reading.records import Submit
 from evopolicy_results.studies.palette import looks
 
 MAX_EPISODES = 256
@@ -48,9 +47,7 @@ def live_run_view(
     if path is None or found is not None:
         rows, traced = found or ([], None)
     else:
-        known = reader.submits(path)
-        summaries = {each.summary.submit_index: each.summary for each in known}
-        rows, traced = submit_rows(list(map(_submit, known)), summaries, href=_address(run.key)), None
+        rows, traced = submit_rows(reader.submits(path), href=_address(run.key)), None
     view = run_view(
         rows,
         entry=run.entry,
@@ -92,7 +89,6 @@ def _finished_rows(
         traced = trace(read_run(folder))
         rows = submit_rows(
             traced.run.submits,
-            {one.index: one.summary for one in read_submits(folder, traced.run.record.artifacts)},
             traced={row.submit.index: row for row in traced.rows},
             folder=folder,
             selected=traced.run.record.outcome.best_submit_index,
@@ -104,22 +100,8 @@ def _finished_rows(
     return rows, traced
 
 
-def _address(key: str) -> Callable[[Shown], str]:
+def _address(key: str) -> Callable[[Submit], str]:
     return lambda submit: f"/run/{key}/submit/{submit.index}"
-
-
-def _submit(one: Submit) -> Shown:
-    summary = one.summary
-    return Shown(
-        index=summary.submit_index,
-        status=summary.status,
-        n_episodes=summary.n_episodes,
-        consumed_before=one.consumed - summary.n_episodes,
-        consumed=one.consumed,
-        mean_return=one.mean,
-        n_failed_episodes=len(summary.errors or ()),
-        started_at=summary.submit_started_at,
-    )
 
 
 def _retried(one: RetriedJobs) -> Happened:
@@ -170,14 +152,14 @@ def _one_run_notices(run: RunFacts, may_show: bool) -> list[dict[str, Any]]:
 
 def submit_values(run: RunFacts, reader: Reader, index: int) -> dict[str, Any]:
     """The parts of one submit's page. NotThereError for a submit that is unknown or has no verdict yet."""
-    submits = {one.summary.submit_index: one for one in (reader.submits(run.path) if run.path else ())}
+    submits = {one.index: one for one in (reader.submits(run.path) if run.path else ())}
     submit = submits.get(index)
     if run.path is None or submit is None:
         raise NotThereError(f"submit {index}")
     detail, may_read = Detail(run.path), run.finished
     code = detail.code(index, checkpoints=may_read)
     previous = detail.code(index - 1, checkpoints=may_read) if index - 1 in submits else ()
-    summary, n = detail.summary(index), submit.summary.n_episodes
+    summary, n = detail.summary(index), submit.n_episodes
     columns = [_numbers(summary.get(name))[:n] for name in ("env_instances", "returns", "episode_lengths")]
     failed = {int(each) for each in _numbers(summary.get("errors")) if each is not None}
     first, known = summary.get("first_global_episode"), detail.episodes(index)
@@ -194,10 +176,9 @@ def submit_values(run: RunFacts, reader: Reader, index: int) -> dict[str, Any]:
         }
         for at, case, value, length in itertools.islice(rows, MAX_EPISODES)
     ]
-    starts = [each.summary.submit_started_at for at in (index - 1, index) if (each := submits.get(at))]
+    starts = [each.started_at for at in (index - 1, index) if (each := submits.get(at))]
     return {
-        "submit": submit.summary,
-        "consumed": submit.consumed,
+        "submit": submit,
         "previous": index - 1 if index - 1 in submits else None,
         "next": index + 1 if index + 1 in submits else None,
         "diffs": diff(_texts(previous), _texts(code)) if previous else [],
