@@ -20,9 +20,10 @@ from evopolicy._arguments import RunKeywords
 from evopolicy._cluster import Cluster, evaluate, evaluate_async, run, run_async
 from evopolicy._evaluation import Episode, Evaluation
 from evopolicy._records import Records
-from evopolicy._runs import EpisodeRecord, Run, Runs, RunSummary, SubmitRecord, load_runs
+from evopolicy._runs import EpisodeRecord, Run, Runs, SubmitRecord, load_runs
 from evopolicy_common import __version__
 from evopolicy_common.errors import ConfigError, EvopolicyError
+from evopolicy_common.records.run_record import RunSummary
 from evopolicy_gateway.agents.function import SubmitRefusedError, Workspace
 
 __all__ = [

@@ -16,40 +16,13 @@ from evopolicy._records import Records, bars
 from evopolicy_common.errors import DECODE_ERRORS, ConfigError, ProtocolError
 from evopolicy_common.records.policies.submits import read_submits
 from evopolicy_common.records.run_files import no_run_below, read_record, run_folders
-from evopolicy_common.records.run_record import RunRecord
+from evopolicy_common.records.run_record import RunRecord, RunSummary
 from evopolicy_common.records.summary import Summary
 from evopolicy_common.regular_files import open_regular
 from evopolicy_gateway.agents.function import RESULT
 
 _MAX_RESULT_BYTES = 1 << 20
 _MAX_SHOWN_VIDEO_BYTES = 4 << 20
-
-
-class RunSummary(msgspec.Struct, frozen=True, kw_only=True):
-    """One row per run."""
-
-    run: str
-    """Path of its folder."""
-    env: str
-    entry: str
-    model: str
-    repeat: int
-    status: str
-    """`completed`, `no_ok_submit`, `error` or `cancelled`."""
-    score: float | None
-    """Held-out mean return of the selected checkpoint; None without an ok submit."""
-    random_score: float | None
-    """Mean return of uniform random actions on the same cases; None when they were not played."""
-    best_submit: int | None
-    """Index of the selected submit, from 0; None unless the run completed."""
-    budget: int
-    """Train episodes."""
-    budget_used: int
-    """Used train episodes."""
-    closed_reason: str
-    """Why the agent's side ended, such as `budget_spent` or `agent_stopped`."""
-    wall_s: float
-    """Wall time from the run's opening to its end, seconds."""
 
 
 class SubmitRecord(msgspec.Struct, frozen=True, kw_only=True):
@@ -108,20 +81,7 @@ class Run:
     @property
     def summary(self) -> RunSummary:
         """The run as one row."""
-        record, outcome = self._record, self._record.outcome
-        return RunSummary(
-            **self._known,
-            model=record.model,
-            repeat=record.repeat,
-            status=outcome.status,
-            score=outcome.score,
-            random_score=None if outcome.random_reference is None else outcome.random_reference.mean_return,
-            best_submit=outcome.best_submit_index,
-            budget=record.experiment_dimensions.episode_budget,
-            budget_used=outcome.budget_used,
-            closed_reason=outcome.closed_reason,
-            wall_s=record.timing.wall_time_seconds,
-        )
+        return self._record.summary(str(self.folder))
 
     @property
     def score(self) -> float | None:

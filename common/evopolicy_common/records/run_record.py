@@ -366,6 +366,36 @@ class Versions(msgspec.Struct, frozen=True, kw_only=True):
         return str(getattr(self, f"data_{_DATA[split]}_hash"))
 
 
+class RunSummary(msgspec.Struct, frozen=True, kw_only=True):
+    """One row per run."""
+
+    run: str
+    """Path of its folder."""
+    env: str
+    entry: str
+    model: str
+    exp_id: str
+    repeat: int
+    status: str
+    """`completed`, `no_ok_submit`, `error` or `cancelled`."""
+    score: float | None
+    """Held-out mean return of the selected checkpoint; None without an ok submit."""
+    random_score: float | None
+    """Mean return of uniform random actions on the same cases; None when they were not played."""
+    best_submit: int | None
+    """Index of the selected submit, from 0; None unless the run completed."""
+    budget: int
+    """Train episodes."""
+    budget_used: int
+    """Used train episodes."""
+    closed_reason: str
+    """Why the agent's side ended, such as `budget_spent` or `agent_stopped`."""
+    wall_s: float
+    """Wall time from the run's opening to its end, seconds."""
+    start: str
+    """The submit of another run that it starts from; empty: the usual workspace."""
+
+
 class RunRecord(msgspec.Struct, frozen=True, kw_only=True):
     """The content of `run.json`."""
 
@@ -416,6 +446,26 @@ class RunRecord(msgspec.Struct, frozen=True, kw_only=True):
         metering = metering_of(None if use is None else use.metering, self.agent.model_string)
         own = Line(jail=self.jail, sandbox_tier=self.sandbox_tier, metering=metering)
         return own if self.start is None else own.weakest(self.start.line)
+
+    def summary(self, folder: str) -> RunSummary:
+        outcome = self.outcome
+        return RunSummary(
+            run=folder,
+            env=self.env,
+            entry=self.agent.entry,
+            model=self.model,
+            exp_id=self.exp_id,
+            repeat=self.repeat,
+            status=outcome.status,
+            score=outcome.score,
+            random_score=outcome.random_score,
+            best_submit=outcome.best_submit_index,
+            budget=self.experiment_dimensions.episode_budget,
+            budget_used=outcome.budget_used,
+            closed_reason=outcome.closed_reason,
+            wall_s=self.timing.wall_time_seconds,
+            start="" if self.start is None else self.start.text,
+        )
 
 
 class _Header(msgspec.Struct, frozen=True, kw_only=True):

@@ -23,7 +23,7 @@ from evopolicy_common.catalogue.installs import Licence, family_of, licences
 from evopolicy_common.messages.operator import RunResult
 from evopolicy_common.records import journal
 from evopolicy_common.records.aggregates import mean
-from evopolicy_common.records.run_record import RunRecord
+from evopolicy_common.records.run_record import RunRecord, RunSummary
 from evopolicy_common.records.summary import utc_text
 from evopolicy_common.records.words import CANARY
 from evopolicy_common.statistics.intervals import Estimate
@@ -31,7 +31,7 @@ from evopolicy_results.publish import contents
 from evopolicy_results.scoring import scores
 from evopolicy_results.statistics.pairs import cell_mean
 
-VERSION = 2
+VERSION = 3
 _TOLERANCE = 0.05
 _LIMITS = {
     "policies' sandbox": (
@@ -66,35 +66,13 @@ class Source(NamedTuple):
     result: RunResult
 
 
-class CardRun(msgspec.Struct, frozen=True, kw_only=True):
-    """One run; `folder` is the one in the published file."""
-
-    folder: str
-    run: str
-    entry: str
-    env: str
-    exp_id: str
-    repeat: int
-    status: str
-    score: float | None
-    """Mean return on the held-out cases; None unless the run completed."""
-    random: float | None
-    """Of uniform random actions on the same cases."""
-    heldout_cases: int
-    submits: int
-    episodes: int
-    """Train episodes that were charged."""
-    start: str = ""
-    """The submit of another run that it starts from; empty: the usual workspace."""
-
-
 class Cell(msgspec.Struct, frozen=True, kw_only=True):
     """All runs of an entry on an environment from one start."""
 
     entry: str
     env: str
     start: str = ""
-    """As of `CardRun`."""
+    """As of `RunSummary`."""
     runs: int
     mean: float | None
     """Of the runs' scores; None where a run has none."""
@@ -150,7 +128,8 @@ class Card(msgspec.Struct, frozen=True, kw_only=True):
     limits: tuple[str, ...]
     licences: tuple[Licence, ...]
     """Of the played families."""
-    runs: tuple[CardRun, ...]
+    runs: tuple[RunSummary, ...]
+    """`run` is the folder in the published file."""
 
 
 def make(
@@ -191,23 +170,7 @@ def make(
         licences=tuple(
             licences(map(family_of, {record.env for record in records})) if claimed is None else claimed
         ),
-        runs=tuple(map(_run, sources)),
-    )
-
-
-def _run(source: Source) -> CardRun:
-    record, outcome, result = source.record, source.record.outcome, source.result
-    return CardRun(
-        **{name: getattr(record, name) for name in ("run", "env", "exp_id", "repeat")},
-        folder=source.folder,
-        entry=record.agent.entry,
-        status=outcome.status,
-        score=outcome.score,
-        random=outcome.random_score,
-        heldout_cases=len(result.heldout_returns),
-        submits=len(result.submits),
-        episodes=result.budget_used,
-        start=_start(record),
+        runs=tuple(each.record.summary(each.folder) for each in sources),
     )
 
 

@@ -8,12 +8,13 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Mapping
 from importlib import resources
-from typing import Any, NamedTuple, get_type_hints
+from typing import Any, NamedTuple, get_args, get_type_hints
 
 import msgspec
 
+from evopolicy_common.records.run_record import RunSummary
 from evopolicy_results.publish import contents
-from evopolicy_results.publish.card import AgentCost, Card, CardRun, Cell
+from evopolicy_results.publish.card import AgentCost, Card, Cell
 
 _SHOWN = 4
 """Values of a condition that the text lists."""
@@ -22,6 +23,8 @@ _KINDS = {
     contents.OPENING: "a run's case file: its settings and its train, validation and held-out cases",
     contents.EPISODES: "returns of a run's episodes",
 }
+
+_DATA_TYPES = {float: "sc:Float", int: "sc:Integer", str: "sc:Text"}
 
 
 class File(NamedTuple):
@@ -134,7 +137,7 @@ def croissant(card: Card, digests: Mapping[str, str], file: File | None = None) 
     contained = {} if file is None else {"containedIn": {"@id": file.name}}
     files = {contents.CARD: "evaluation card, with a row for each run", contents.JOURNAL: "journal"}
     for run in card.runs:
-        files |= {f"{run.folder}/{name}": text for name, text in _KINDS.items()}
+        files |= {f"{run.run}/{name}": text for name, text in _KINDS.items()}
     distribution = [
         {**_file(name, text, digests[name]), "encodingFormat": "application/json", **contained}
         for name, text in files.items()
@@ -155,7 +158,10 @@ def croissant(card: Card, digests: Mapping[str, str], file: File | None = None) 
         "rai:dataLimitations": list(card.limits),
         "distribution": distribution,
         "recordSet": [
-            {**_node("cr:RecordSet", "runs", "runs"), "field": list(map(_field, CardRun.__struct_fields__))}
+            {
+                **_node("cr:RecordSet", "runs", "runs"),
+                "field": list(map(_field, RunSummary.__struct_fields__)),
+            }
         ],
     }
     shared = msgspec.json.decode(resources.files(__package__).joinpath("croissant.json").read_bytes())
@@ -171,6 +177,7 @@ def _file(name: str, text: str, sha256: str) -> dict[str, Any]:
 
 
 def _field(name: str) -> dict[str, Any]:
-    kind = {float | None: "sc:Float", int: "sc:Integer", str: "sc:Text"}[get_type_hints(CardRun)[name]]
+    kind = get_type_hints(RunSummary)[name]
+    kind = next(text for of, text in _DATA_TYPES.items() if of in (kind, *get_args(kind)))
     source = {"fileObject": {"@id": contents.CARD}, "extract": {"jsonPath": f"$.runs[*].{name}"}}
     return {**_node("cr:Field", f"runs/{name}", name), "dataType": kind, "source": source}
