@@ -6,11 +6,11 @@ from collections.abc import Iterable
 
 from rigs.core_rig import key_of
 
+from evopolicy_common.messages.operator import RunFinished
 from evopolicy_coordinator.core.contract.records import (
     BegunRow,
     DocumentRow,
     EvaluationRow,
-    FinishedRow,
     JournalRow,
     KernelRow,
     OutcomeRow,
@@ -30,7 +30,7 @@ _TABLES: dict[type, str] = {
     RunStateRow: "states",
     SubmitRow: "submits",
     BegunRow: "begun",
-    FinishedRow: "finished",
+    RunFinished: "finished",
     EvaluationRow: "evaluations",
     WorkerRow: "workers",
     PermitRow: "permits",
@@ -49,7 +49,7 @@ class Disk:
         self.outcomes: dict[str, dict[int, OutcomeRow]] = {}
         self.begun: dict[tuple[str, int], BegunRow] = {}
         self.evaluations: dict[str, EvaluationRow] = {}
-        self.finished: dict[str, FinishedRow] = {}
+        self.finished: dict[str, RunFinished] = {}
         self.workers: dict[str, WorkerRow] = {}
         self.permits: dict[tuple[str, str], PermitRow] = {}
         self.kernels: dict[str, KernelRow] = {}

@@ -140,8 +140,8 @@ class RunResult(msgspec.Struct, frozen=True, kw_only=True):
         return {one.submit_index: one.val_mean for one in self.submits if one.val_mean is not None}
 
 
-class RunFinished(RunResult, frozen=True, kw_only=True):
-    """A finalised run as stored by the coordinator: the source of `run.json`."""
+class RunFinished(RunResult, frozen=True, kw_only=True, tag="finished"):
+    """A finalised run, as the coordinator stores it and its operator gets it: the source of `run.json`. Key: `run`."""
 
     settings: RunSettings
     error: Text | None

@@ -20,11 +20,11 @@ from pathlib import Path
 import msgspec
 
 from evopolicy_common.errors import ConfigError, StorageError
+from evopolicy_common.messages.operator import RunFinished
 from evopolicy_common.messages.status import DiskUse
 from evopolicy_coordinator.core.contract.records import (
     BegunRow,
     EvaluationRow,
-    FinishedRow,
     OutcomeRow,
     RunRow,
     SubmitRow,
@@ -100,7 +100,7 @@ def collect(
     with _database(state) as db:
         blobs = blobs_of(state, place_of(state))
         unheld = blobs.unheld(UNNAMED_S, now, dry_run=dry_run)  # before it is read which ones are named
-        old_runs = [row.run for row in rows(db, FinishedRow) if row.result.finished_at < now - older_than_s]
+        old_runs = [row.run for row in rows(db, RunFinished) if row.finished_at < now - older_than_s]
         old = (
             row
             for row in rows(db, EvaluationRow, "WHERE finished = 1")

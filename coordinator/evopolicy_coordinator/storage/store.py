@@ -37,7 +37,7 @@ BUSY_TIMEOUT_S = 10.0
 """How long to wait for another process's transaction: `evopolicy gc` runs beside a coordinator."""
 
 _PAGE_ROWS = 10_000
-SCHEMA = 7
+SCHEMA = 8
 """Version of the tables and of the rows in them."""
 _NAMED_AT_ONCE = 500
 NAMED, CONDEMNED = -1, -2
@@ -89,7 +89,7 @@ _PLACES: dict[type[Any], _Place] = {
     records.OutcomeHead: _Place("outcomes", ("grp", "idx"), column="head"),
     records.BegunRow: _Place("begun", ("grp", "first")),
     records.EvaluationRow: _Place("evaluations", ("evaluation",), ("key", "finished")),
-    records.FinishedRow: _Place("finished", ("run",)),
+    RunFinished: _Place("finished", ("run",)),
     records.WorkerRow: _Place("workers", ("worker",)),
     records.PermitRow: _Place("permits", ("run", "boot_id"), ("ended",)),
     records.KernelRow: _Place("kernels", ("worker",)),
@@ -297,8 +297,7 @@ class Reader:
 
     def finished(self, run: str) -> RunFinished | None:
         """The result of a run; None while it is not finished."""
-        row = self.one(records.FinishedRow, run=run)
-        return None if row is None else row.result
+        return self.one(RunFinished, run=run)
 
     def journal(self, cursor: int, max_bytes: int) -> tuple[records.JournalRow, ...]:
         """Entries of the journal from `cursor` on, up to `max_bytes` but at least one; empty past the last entry."""

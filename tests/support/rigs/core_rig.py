@@ -32,7 +32,6 @@ from evopolicy_coordinator.core.contract.effects import (
 from evopolicy_coordinator.core.contract.records import (
     BegunRow,
     EvaluationRow,
-    FinishedRow,
     JournalRow,
     KernelRow,
     OutcomeRow,
@@ -325,7 +324,7 @@ class Rig:
         return row
 
     def finished(self, run: str = "r1") -> RunFinished:
-        return self.row(FinishedRow, run).result
+        return self.row(RunFinished, run)
 
 
 def done(lease: wire.Lease, value: float = 1.0, failure: FailureCategory | None = None) -> wire.JobResult:

@@ -82,7 +82,7 @@ class ReadEvaluation(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class ReadFinished(msgspec.Struct, frozen=True, kw_only=True):
-    """Answer `request` with `RunProgress(phase="finished", …)` holding the run's `FinishedRow.result`."""
+    """Answer `request` with `RunProgress(phase="finished", …)` holding the run's `RunFinished`."""
 
     request: RequestId
     run: str

@@ -173,13 +173,6 @@ class EvaluationRow(msgspec.Struct, frozen=True, kw_only=True, tag="evaluation")
     """Hidden cases that it does not play, but counts as sharing: those of the run whose checkpoint is re-scored."""
 
 
-class FinishedRow(msgspec.Struct, frozen=True, kw_only=True, tag="finished"):
-    """A finalised run: the source of `run.json`. Key: `run`."""
-
-    run: str
-    result: RunFinished
-
-
 class WorkerRow(msgspec.Struct, frozen=True, kw_only=True, tag="worker"):
     """The state of a worker, set by an operator. Key: `worker`."""
 
@@ -235,7 +228,7 @@ Row = (
     | OutcomeRow
     | BegunRow
     | EvaluationRow
-    | FinishedRow
+    | RunFinished
     | WorkerRow
     | PermitRow
     | KernelRow

@@ -21,7 +21,6 @@ from evopolicy_coordinator.core.contract import events
 from evopolicy_coordinator.core.contract.effects import ReadFinished
 from evopolicy_coordinator.core.contract.reasons import because
 from evopolicy_coordinator.core.contract.records import (
-    FinishedRow,
     SubmitRow,
     random_group,
     submit_group,
@@ -175,7 +174,7 @@ def _finish(
         groups.close_group(state, group, step)
     result = finished.result(state, run, best, step.now, cancelled=cancelled, error=error)
     result = journal.ended(state, result, step)
-    step.persist(FinishedRow(run=run.id, result=result))
+    step.persist(result)
     step.change_run(run, phase="finished", remaining_budget=run.ledger.available, n_submits=len(run.submits))
     runs.forget(state, run)
     for poll in state.polls.take_all(run.id):

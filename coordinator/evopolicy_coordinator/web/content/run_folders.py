@@ -20,10 +20,11 @@ import msgspec
 
 from evopolicy_common.confined import MAX_NAMES, Confined
 from evopolicy_common.errors import DECODE_ERRORS, ProtocolError
+from evopolicy_common.messages.operator import CreateRun
 from evopolicy_common.messages.run_settings import Start
 from evopolicy_common.messages.status import RunStatus
 from evopolicy_common.records import open_run
-from evopolicy_common.records.open_run import IntendedRun, OpenedRun
+from evopolicy_common.records.open_run import OpenedRun
 from evopolicy_common.records.policies.submits import read_submits
 from evopolicy_common.records.run_files import RUN_JSON, read_record
 from evopolicy_common.records.suite_folder import INDEX, PAUSED, Index, SweepRun
@@ -232,7 +233,7 @@ class Reader:
         ]
 
     def _open(self, folder: Path, entry: SweepRun | None, by_run: Mapping[str, RunStatus]) -> RunFacts:
-        intended = _decoded(folder, open_run.INTENDED, IntendedRun)
+        intended = _decoded(folder, open_run.INTENDED, CreateRun)
         opened = _decoded(folder, open_run.OPENED, OpenedRun)
         run = "" if opened is None else opened.run
         status, submits = by_run.get(run), self.submits(folder)

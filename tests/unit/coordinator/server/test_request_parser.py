@@ -25,7 +25,7 @@ from evopolicy_common.messages.status import StatusRequest
 from evopolicy_common.messages.worker import Message
 from evopolicy_common.records.blobs import BlobStore
 from evopolicy_common.wire import codec, keys
-from evopolicy_coordinator.core.contract.records import FinishedRow, JournalRow, RunRow
+from evopolicy_coordinator.core.contract.records import JournalRow, RunRow
 from evopolicy_coordinator.pki.machines import Machines
 from evopolicy_coordinator.server import request_checks
 from evopolicy_coordinator.server.definitions import Definitions
@@ -435,7 +435,7 @@ def test_a_rescore_takes_all_but_its_cases_from_the_run(
 ) -> None:
     ref, store = blob(b"policy"), Store(tmp_path / "db")
     row, result = finished_pair(parser, blobs)
-    store.write([row, FinishedRow(run=row.run, result=result)])
+    store.write([row, result])
     wanted = operator.FurtherCasesRequest(token="operate", run=row.run, name="more", n=4)
     found = parser.runs.further_cases(wanted)
     seeds = {case.seed for case in (*row.train, *row.validation, *row.heldout, *found.cases)}
