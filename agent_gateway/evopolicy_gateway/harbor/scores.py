@@ -30,8 +30,8 @@ from starlette.routing import Route
 from evopolicy_common.cli.conventions import end_on_sigterm, fail_on_our_errors, run_to_end
 from evopolicy_common.cli.frame import App
 from evopolicy_common.errors import ConfigError, EvopolicyError
+from evopolicy_common.messages.operator import CreateRun
 from evopolicy_common.records.blobs import write_atomically
-from evopolicy_common.records.open_run import IntendedRun
 from evopolicy_common.records.run_files import read_record
 from evopolicy_common.records.words import in_words
 from evopolicy_common.terminal import say
@@ -139,7 +139,7 @@ def write_task(tasks: Path, run: Path, url: str, agent_s: float) -> Path:
         other = _run_of(place / "task.toml").root
         if other.resolve() != folder.root.resolve():
             raise ConfigError(f"{place} is already the task of {other}; name another folder with --tasks")
-    env = saved(folder.intended, IntendedRun).settings.env
+    env = saved(folder.intended, CreateRun).settings.env
     files = task_files(
         folder, env=env, url=f"{url}/{place.name}", token=token_of(tasks, place.name), agent_s=agent_s
     )

@@ -31,12 +31,12 @@ from typing import Literal
 import msgspec
 
 from evopolicy_common.errors import ConfigError, EvopolicyError
-from evopolicy_common.messages.operator import RunFinished
+from evopolicy_common.messages.operator import CreateRun, RunFinished
 from evopolicy_common.processes import child_process
 from evopolicy_common.processes.left_files import keep_to_owner
 from evopolicy_common.processes.preflight import LOOPBACK
 from evopolicy_common.processes.scratch import remove_tree
-from evopolicy_common.records.open_run import IntendedRun, OpenedRun
+from evopolicy_common.records.open_run import OpenedRun
 from evopolicy_common.records.run_files import read_record
 from evopolicy_common.records.run_record import RunRecord
 from evopolicy_common.wire import credentials
@@ -150,7 +150,7 @@ class RunLifecycle:
         async with child_process.starting():
             plan.check_held()
         replays = plan.replays
-        wanted = IntendedRun(
+        wanted = CreateRun(
             key=uuid.uuid4().hex,
             settings=plan.settings,
             replay_key="" if replays is None else replays.key,
@@ -172,14 +172,14 @@ class RunLifecycle:
         if plan.listener is not None:
             save(folder.listener, plan.listener)
 
-    async def _ask(self, wanted: IntendedRun) -> IntendedRun:
+    async def _ask(self, wanted: CreateRun) -> CreateRun:
         """Opens the run and returns the request for it while the folder has its earlier run, which a refusal keeps.
 
         The request is kept beside the folder, so that a command that is killed meanwhile finds the run again.
         """
         folder = self._folder
         if folder.asked.exists():
-            before = saved(folder.asked, IntendedRun)
+            before = saved(folder.asked, CreateRun)
             if before.settings == wanted.settings:
                 wanted = before
             else:
@@ -206,7 +206,7 @@ class RunLifecycle:
             self.run = saved(folder.opened_run, OpenedRun).run
             token = credentials.read_credentials(folder.credentials).token
         else:
-            created = await self._operations.create(saved(folder.intended, IntendedRun))
+            created = await self._operations.create(saved(folder.intended, CreateRun))
             self.run, token = created.run, created.capability
         credentials.write(msgspec.structs.replace(self._credentials, token=token), folder.credentials)
         phase: str | None = "open"

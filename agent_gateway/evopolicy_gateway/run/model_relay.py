@@ -21,8 +21,8 @@ import msgspec
 import evopolicy_common
 import evopolicy_gateway
 from evopolicy_common.errors import EvopolicyError
+from evopolicy_common.messages.operator import CreateRun
 from evopolicy_common.processes.preflight import LOOPBACK
-from evopolicy_common.records.open_run import IntendedRun
 from evopolicy_common.records.secrets import Redaction, without_keys
 from evopolicy_common.wire.http import bound
 from evopolicy_gateway.agent_supervisor.supervisor import secrets_in
@@ -141,7 +141,7 @@ def of_run(run: OpenRun, ready: Ready, model_spent: asyncio.Event) -> ModelRelay
             folder=folder.model_record,
             root=folder.root,
             run=run.run,
-            key=saved(folder.intended, IntendedRun).key,
+            key=saved(folder.intended, CreateRun).key,
             port=service.port,
             token=service.token,
             model_port=made.port,

@@ -7,12 +7,14 @@ from collections.abc import AsyncGenerator, AsyncIterator, Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+import msgspec
+
 from evopolicy_common.errors import ConfigError, EvopolicyError, RefusedError
 from evopolicy_common.logs import structlog
 from evopolicy_common.messages import operator as messages
 from evopolicy_common.messages.episode import EpisodeOutcome
 from evopolicy_common.processes.notices import notify_if_slow
-from evopolicy_common.records.open_run import IntendedRun, OpenedRun
+from evopolicy_common.records.open_run import OpenedRun
 from evopolicy_common.records.run_files import read_record
 from evopolicy_common.refusals import WRONG_SETTINGS, Refusal
 from evopolicy_common.wire import credentials
@@ -34,7 +36,7 @@ class Operations(OperatorClient):
         """`opened`: as `LocalCluster.opened`; None for a cluster that was not started here."""
         super().__init__(link, own=opened is not None)
         self._opened = opened
-        self._intended: dict[str, IntendedRun] = {}
+        self._intended: dict[str, messages.CreateRun] = {}
         """The requests that opened runs, by run: a coordinator on an earlier backup opens them again."""
 
     def watched_by(self, run: str, locks: Sequence[Path]) -> None:
@@ -42,13 +44,11 @@ class Operations(OperatorClient):
         if self._opened is not None:
             self._opened(run, locks)
 
-    async def create(self, wanted: IntendedRun, run: str = "") -> messages.RunCreated:
+    async def create(self, wanted: messages.CreateRun, run: str = "") -> messages.RunCreated:
         """Opens a run, or `run` again; the same key returns the same run. Raises ConfigError for refused settings."""
-        known: dict[str, Any] = {"key": wanted.key, "replay_key": wanted.replay_key, "run": run}
-        message = messages.CreateRun(token=self._token, settings=wanted.settings, **known)
+        message = msgspec.structs.replace(wanted, token=self._token, run=run)
         try:
-            timeout_s = None if run else TIMEOUT_S
-            known = {"despite": _AWAY, "timeout_s": timeout_s}
+            known: dict[str, Any] = {"despite": _AWAY, "timeout_s": None if run else TIMEOUT_S}
             created = await self._requests.until_answered("create", message, messages.RunCreated, **known)
         except RefusedError as error:
             raise _settings_error(error) from error
@@ -77,7 +77,7 @@ class Operations(OperatorClient):
         """The phase of a folder's open run, opened again if the cluster has lost it; None when it cannot be."""
         run = saved(folder.opened_run, OpenedRun).run
         if folder.intended.exists():
-            self._intended[run] = saved(folder.intended, IntendedRun)
+            self._intended[run] = saved(folder.intended, messages.CreateRun)
         return await self.phase(run)
 
     async def end_lost(self, run: str) -> str | None:
@@ -129,7 +129,7 @@ class Operations(OperatorClient):
             run = saved(folder.opened_run, OpenedRun).run
         elif folder.intended.exists():
             # The coordinator may have opened it, and the command was killed before it had the answer.
-            intended = saved(folder.intended, IntendedRun)
+            intended = saved(folder.intended, messages.CreateRun)
             try:
                 run = (await self.create(intended)).run
             except (ConfigError, RefusedError):

@@ -14,11 +14,12 @@ import msgspec
 from evopolicy_common import catalogue
 from evopolicy_common.errors import ConfigError, EvopolicyError, ProtocolError
 from evopolicy_common.messages.environment import StepLimit
+from evopolicy_common.messages.operator import CreateRun
 from evopolicy_common.messages.run_settings import RunSettings, Start
 from evopolicy_common.processes.preflight import check_installed, check_loopback, check_text, check_writable
 from evopolicy_common.processes.scratch import remove_tree
 from evopolicy_common.records.model_record import Level
-from evopolicy_common.records.open_run import IntendedRun, OpenedRun
+from evopolicy_common.records.open_run import OpenedRun
 from evopolicy_common.records.policies import trees
 from evopolicy_common.records.policies.trees import Tree
 from evopolicy_common.records.run_files import read_record
@@ -292,10 +293,10 @@ class Plan(msgspec.Struct, frozen=True, kw_only=True):
                 " their folders have one name. Choose another --entry, --exp-id or --runs"
             )
 
-    def intended(self) -> IntendedRun | None:
+    def intended(self) -> CreateRun | None:
         """The request that opened the run in the folder; None when there is none."""
         with contextlib.suppress(FileNotFoundError):
-            return saved(self.folder.intended, IntendedRun)
+            return saved(self.folder.intended, CreateRun)
         return None
 
     def claim(self) -> None:

@@ -18,7 +18,7 @@ from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, cast, get_args
+from typing import Any, cast
 
 import msgspec
 
@@ -103,7 +103,7 @@ async def write(
     selected: Bundle | None = None
     code: dict[int, CodeMetrics | None] = {}
     folder.checkpoints.mkdir(exist_ok=True)
-    rejected: list[Rejected] = []
+    rejected: list[schema.RejectedSubmit] = []
     kept: dict[int, str | None] = {}
     with optional("the gateway's journal"):
         rejected, kept = await asyncio.to_thread(_from_journal, folder)
@@ -166,7 +166,7 @@ def claims(
     plan: Plan,
     facts: dict[str, object],
     staged: Staged | None = None,
-    rejected: Sequence[Rejected] = (),
+    rejected: Sequence[schema.RejectedSubmit] = (),
     times: Times = _NO_TIMES,
     **more: Any,
 ) -> Claims:
@@ -182,16 +182,7 @@ def claims(
         feedback_s=times.feedback_s,
         held_s=times.held_s,
         permit_s=times.permit_s,
-        rejected_submits=tuple(
-            schema.RejectedSubmit(
-                status=cast(schema.RejectedStatus, one.status),
-                message=one.message,
-                at=utc_text(one.at),
-                after_submits=one.after_submits,
-            )
-            for one in rejected
-            if one.status in get_args(schema.RejectedStatus)
-        ),
+        rejected_submits=tuple(rejected),
         **more,
     )
 
@@ -279,7 +270,7 @@ def _own_bundle(folder: RunFolder, digest: str | None) -> Bundle | None:
     return None
 
 
-def _from_journal(folder: RunFolder) -> tuple[list[Rejected], dict[int, str | None]]:
+def _from_journal(folder: RunFolder) -> tuple[list[schema.RejectedSubmit], dict[int, str | None]]:
     """The refused requests, and by submit the digest of a `system/` without a policy, which only the gateway has."""
     if not folder.journal.exists():
         return [], {}
@@ -287,7 +278,7 @@ def _from_journal(folder: RunFolder) -> tuple[list[Rejected], dict[int, str | No
         entries = journal.entries.values()
     kept = {entry.key: entry.kept for entry in entries if isinstance(entry, Requested)}
     accepted = [entry for entry in entries if isinstance(entry, Accepted)]
-    rejected = [entry for entry in entries if isinstance(entry, Rejected)]
+    rejected = [entry.submit for entry in entries if isinstance(entry, Rejected)]
     return rejected, {entry.submit_index: kept.get(entry.key) for entry in accepted}
 
 

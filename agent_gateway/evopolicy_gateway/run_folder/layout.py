@@ -112,13 +112,13 @@ class RunFolder(msgspec.Struct, frozen=True):
 
     @property
     def asked(self) -> Path:
-        """`IntendedRun` of a run that is to take the place of the folder's; beside it, as the lock."""
+        """`CreateRun` of a run that is to take the place of the folder's; beside it, as the lock."""
         return self.root.with_name(f".{self.root.name}.asked")
 
     supervisor_lock = Place(f"{open_run.STATE}/keeper.lock")
     """Lock of the agent supervisor while the agent may be alive, even if the command that started it was killed."""
     intended = Place(open_run.INTENDED)
-    """The request to open the run, written before it is sent: `IntendedRun`."""
+    """The request to open the run, written before it is sent: `CreateRun`."""
     session = Place(f"{open_run.STATE}/session.json")
     """A coding agent's session: `SessionState`."""
     times = Place(f"{open_run.STATE}/times.json")

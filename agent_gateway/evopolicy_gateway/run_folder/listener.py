@@ -20,9 +20,9 @@ from urllib.parse import urlsplit
 import msgspec
 
 from evopolicy_common.errors import ConfigError
+from evopolicy_common.messages.operator import CreateRun
 from evopolicy_common.messages.run_settings import ELSEWHERE
 from evopolicy_common.processes import proc
-from evopolicy_common.records.open_run import IntendedRun
 from evopolicy_common.wire.credentials import host_and_port
 from evopolicy_gateway.run_folder.layout import RunFolder, saved
 
@@ -111,7 +111,7 @@ def ends_unseen(folder: RunFolder) -> bool:
 
 def _agent_host(folder: RunFolder) -> str:
     with contextlib.suppress(FileNotFoundError):
-        return saved(folder.intended, IntendedRun).settings.agent_host
+        return saved(folder.intended, CreateRun).settings.agent_host
     return ""
 
 

@@ -23,6 +23,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Mapping
+from typing import cast, get_args
 
 import msgspec
 
@@ -32,6 +33,8 @@ from evopolicy_common.messages.gateway import CANCELLED, RunOpened, RunState
 from evopolicy_common.records import open_run
 from evopolicy_common.records.blobs import digest_of
 from evopolicy_common.records.open_run import AnyLine, Requested
+from evopolicy_common.records.run_record import RejectedStatus, RejectedSubmit
+from evopolicy_common.records.summary import utc_text
 from evopolicy_common.refusals import RUN_OVER, Refusal
 from evopolicy_gateway.run_folder.layout import submit_id
 from evopolicy_gateway.submits.snapshots import Snapshot
@@ -227,12 +230,16 @@ class TicketMachine:
         return self.in_flight
 
     def reject(self, error: RequestError, now: float) -> open_run.Rejected | None:
-        """Counts a refused request; returns its entry, up to a maximum number. `now`: Unix time, seconds."""
+        """Counts a refused request that `run.json` lists; returns its entry, up to a maximum number. `now`: Unix time,
+        seconds."""
+        if error.status not in get_args(RejectedStatus):
+            return None
         self.n_rejected += 1
         if self.n_rejected > MAX_REJECTED_KEPT:
             return None
-        n = self.state.n_submits
-        return open_run.Rejected(status=error.status, message=error.message, at=now, after_submits=n)
+        status, n = cast(RejectedStatus, error.status), self.state.n_submits
+        one = RejectedSubmit(status=status, message=error.message, at=utc_text(now), after_submits=n)
+        return open_run.Rejected(submit=one)
 
     # Effects, and their outcomes.
 

@@ -12,11 +12,12 @@ from pathlib import Path
 import msgspec
 
 from evopolicy_common.messages.episode import PolicyFailure
-from evopolicy_common.messages.run_settings import RunSettings
+from evopolicy_common.records.run_record import RejectedSubmit
 
 STATE = ".gateway"
 """The gateway's own folder, while the run is open."""
 INTENDED = f"{STATE}/intended.json"
+"""The request to open the run: `CreateRun`. A command that was killed in between repeats it and gets the same run."""
 OPENED = f"{STATE}/run.json"
 LISTENER = f"{STATE}/door.json"
 """There for a remote agent."""
@@ -48,15 +49,6 @@ class OpenedRun(msgspec.Struct, frozen=True, kw_only=True):
     run: str
     agents_md: str = ""
     """The operator's text in place of `AGENTS.md`; empty: the standard text."""
-
-
-class IntendedRun(msgspec.Struct, frozen=True, kw_only=True):
-    """The request to open a run. A command that was killed in between repeats it unchanged and gets the same run."""
-
-    key: str
-    settings: RunSettings
-    replay_key: str = ""
-    """As in `CreateRun`."""
 
 
 class JournalLine(msgspec.Struct, frozen=True, kw_only=True, tag_field="what"):
@@ -111,12 +103,7 @@ class Refused(JournalLine, frozen=True, kw_only=True, tag="refused"):
 class Rejected(JournalLine, frozen=True, kw_only=True, tag="rejected"):
     """A request with an invalid form or outside the bounds, refused here before the snapshot."""
 
-    status: str
-    message: str
-    at: float
-    """Unix time, seconds."""
-    after_submits: int
-    """Number of submits accepted before it."""
+    submit: RejectedSubmit
 
 
 class Died(JournalLine, frozen=True, kw_only=True, tag="died"):

@@ -11,10 +11,10 @@ import pytest
 from gateway_double import Double, gateway_on, opened, prepared, served
 
 from evopolicy_common.messages.gateway import CloseRun, OpenRun, RequestPermit
+from evopolicy_common.messages.operator import CreateRun
 from evopolicy_common.messages.run_settings import ELSEWHERE, RunSettings
 from evopolicy_common.messages.worker import Message
 from evopolicy_common.processes import proc
-from evopolicy_common.records.open_run import IntendedRun
 from evopolicy_gateway.processes import child_messages
 from evopolicy_gateway.run.gateway import Gateway
 from evopolicy_gateway.run_folder import listener
@@ -51,7 +51,7 @@ async def until(what: Callable[[], object]) -> None:
 def remote(folder: RunFolder, agent_host: str) -> None:
     save(folder.listener, Listener(host="127.0.0.1", port=0))
     settings = RunSettings(env="toy/line", entry="e", model="m", exp_id="x", agent_host=agent_host)
-    save(folder.intended, IntendedRun(key="k", settings=settings))
+    save(folder.intended, CreateRun(key="k", settings=settings))
 
 
 async def test_nothing_is_served_before_the_permit_and_the_operator_hears_why(tmp_path: Path) -> None:

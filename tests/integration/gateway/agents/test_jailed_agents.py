@@ -13,7 +13,7 @@ from stages.declared_inputs import DESCRIPTION, declare
 from stages.model_api import CACHED, INPUT, OUTPUT, SUBMIT, ModelApi, Step, llm_agent
 
 from evopolicy_common.errors import ConfigError
-from evopolicy_common.records.open_run import IntendedRun
+from evopolicy_common.messages.operator import CreateRun
 from evopolicy_common.records.run_record import inputs_digest
 from evopolicy_gateway import harnesses
 from evopolicy_gateway.inputs.declared import read_inputs
@@ -125,7 +125,7 @@ def test_a_run_with_skills_needs_the_same_skills_and_a_jail(tmp_path: Path) -> N
     assert opened.settings.inputs == inputs_digest(opened.texts.inputs) != ""
     assert harnesses.config_of(opened.agent, tmp_path) is not None
     opened.folder.state.mkdir(parents=True)
-    save(opened.folder.intended, IntendedRun(key="k", settings=opened.settings))
+    save(opened.folder.intended, CreateRun(key="k", settings=opened.settings))
     plan(tmp_path, resume=True).check()
     (tmp_path / "skills" / "lamps" / "SKILL.md").write_text("Answer 43.")
     with pytest.raises(ConfigError, match="other skills or MCP servers than are declared now"):

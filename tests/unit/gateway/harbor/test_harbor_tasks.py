@@ -15,8 +15,8 @@ from invented.run_dirs import write_run
 from starlette.testclient import TestClient
 
 from evopolicy_common.errors import ConfigError
+from evopolicy_common.messages.operator import CreateRun
 from evopolicy_common.messages.run_settings import RunSettings
-from evopolicy_common.records.open_run import IntendedRun
 from evopolicy_gateway.harbor import scores
 from evopolicy_gateway.harbor.scores import make_app, tasks_in, token_of, write_task
 from evopolicy_gateway.run_folder.layout import RunFolder, save
@@ -37,7 +37,7 @@ def open_run(tmp_path: Path, entry: str = "GPT 5.5 (Codex)") -> RunFolder:
     save(folder.listener, Listener(host="10.0.0.5", port=0))
     save(
         folder.intended,
-        IntendedRun(key="k", settings=RunSettings(env="gym/acrobot", entry="e", model="m", exp_id="first")),
+        CreateRun(key="k", settings=RunSettings(env="gym/acrobot", entry="e", model="m", exp_id="first")),
     )
     folder.bearer.write_text("b" * 64 + "\n")
     return folder

@@ -17,8 +17,7 @@ from rigs.finished_run import finished, plan_in, record_in
 from evopolicy_common.errors import ConfigError, ProtocolError
 from evopolicy_common.messages.episode import LARGEST_LIMIT, LARGEST_LIMITS, ResourceLimits
 from evopolicy_common.messages.run_settings import PUBLISHED, off_profile
-from evopolicy_common.records.open_run import Rejected
-from evopolicy_common.records.run_record import decode_run_record, encode_run_record
+from evopolicy_common.records.run_record import RejectedSubmit, decode_run_record, encode_run_record
 from evopolicy_gateway.cli.play import _unjailed
 from evopolicy_gateway.declared import declared, set_values
 from evopolicy_gateway.jail.settings import JailSettings
@@ -68,10 +67,7 @@ STAGED = Staged(agents_md_hash="h", rules_hash="r", initial_policy_hash="i")
 
 
 def test_a_completed_run_is_recorded_with_all_its_numbers(tmp_path: Path) -> None:
-    rejected = [
-        Rejected(status="budget_invalid", message="no", at=105.0, after_submits=1),
-        Rejected(status="conflict", message="busy", at=106.0, after_submits=1),
-    ]
+    rejected = [RejectedSubmit(status="budget_invalid", message="no", after_submits=1)]
     times = Times(open_s=9.0, in_flight_s=4.0, feedback_s=0.5)
     counted = {"steps": 10, "action_invalid": 3}
     known: dict[str, Any] = {"staged": STAGED, "rejected": rejected, "times": times, "transitions": counted}

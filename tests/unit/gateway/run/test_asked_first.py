@@ -11,9 +11,8 @@ import pytest
 from rigs.finished_run import plan_in
 
 from evopolicy_common.errors import ConfigError
-from evopolicy_common.messages.operator import RunCreated
+from evopolicy_common.messages.operator import CreateRun, RunCreated
 from evopolicy_common.messages.run_settings import RunSettings
-from evopolicy_common.records.open_run import IntendedRun
 from evopolicy_gateway.run.lifecycle import RunLifecycle
 
 
@@ -24,7 +23,7 @@ class Operations:
         self.open: dict[str, RunSettings] = {}
         self.refuses = False
 
-    async def create(self, wanted: IntendedRun) -> RunCreated:
+    async def create(self, wanted: CreateRun) -> RunCreated:
         if self.refuses:
             raise ConfigError("the cases are public")
         self.open[wanted.key] = wanted.settings
@@ -44,7 +43,7 @@ def ask(folder: Path, operations: Operations, budget: int = 8) -> str:
     async def main() -> str:
         nothing: Any = object()
         lifecycle = RunLifecycle(plan, operations, nothing, nothing)  # type: ignore[arg-type]
-        return (await lifecycle._ask(IntendedRun(key=uuid.uuid4().hex, settings=settings))).key
+        return (await lifecycle._ask(CreateRun(key=uuid.uuid4().hex, settings=settings))).key
 
     key = asyncio.run(main())
     assert plan.folder.run_json.read_text() == "earlier"

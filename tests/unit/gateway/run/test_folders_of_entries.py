@@ -12,7 +12,7 @@ from rigs.finished_run import SETTINGS, plan_in
 from stages.sweep_stage import EVOLVE, HEAD, record_of
 
 from evopolicy_common.errors import ConfigError
-from evopolicy_common.records.open_run import IntendedRun
+from evopolicy_common.messages.operator import CreateRun
 from evopolicy_common.records.run_record import encode_run_record
 from evopolicy_common.records.suite_folder import INDEX, PAUSED
 from evopolicy_gateway.run.plan import Plan, check_apart
@@ -70,7 +70,7 @@ def test_a_folder_that_a_file_system_shares_keeps_its_run(
     if state == "open":
         first.folder.run_json.unlink()
         first.folder.state.mkdir()
-        save(first.folder.intended, IntendedRun(key="k", settings=first.settings))
+        save(first.folder.intended, CreateRun(key="k", settings=first.settings))
     (tmp_path / "alpha").symlink_to("Alpha")
     second = msgspec.structs.replace(other(first, entry="alpha"), **({"overwrite": False} | how))
     with pytest.raises(ConfigError, match="holds a run of 'Alpha' on 'toy/line', not of 'alpha'"):

@@ -18,6 +18,7 @@ from evopolicy_common.records.open_run import (
     Requested,
     Settled,
 )
+from evopolicy_common.records.run_record import RejectedSubmit
 from evopolicy_gateway.run_folder.journal import Journal
 from evopolicy_gateway.run_folder.layout import RunFolder, save, saved
 
@@ -28,7 +29,7 @@ ENTRIES: list[AnyLine] = [
     REQUESTED,
     Accepted(key="k", submit_index=0, first_global_episode=0, remaining_budget=3),
     Settled(key="k", status="ok", summary='{\n  "a": "é\u2028"\n}\n'),
-    Rejected(status="budget_invalid", message="no", at=1.5, after_submits=1),
+    Rejected(submit=RejectedSubmit(status="budget_invalid", message="no", at="1.5", after_submits=1)),
 ]
 
 
