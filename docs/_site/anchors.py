@@ -29,9 +29,9 @@ from evopolicy_common.statistics.intervals import over_cases  # noqa: E402
 from evopolicy_worker.environments.interface.base import Environment  # noqa: E402
 from evopolicy_worker.environments.registry import make  # noqa: E402
 
-FILE = TOP / "common" / "evopolicy_common" / "catalogue" / "catalogue.json"
+FILE = TOP / "common" / "evopolicy_common" / "catalogue" / "anchors.json"
 PAGE = TOP / "docs" / "reference" / "environments.md"
-MARKS = ("<!-- Written by docs/_site/anchors.py. -->", "<!-- End of what catalogue.py writes. -->")
+MARKS = ("<!-- Written by docs/_site/anchors.py. -->", "<!-- End of what anchors.py writes. -->")
 N_CASES = 32
 
 

@@ -57,7 +57,7 @@ def test_an_unknown_name_is_refused_naming_what_is_near(pattern: str, near: str)
 def test_anchors_of_core16_and_every_family_have_width_and_a_policy() -> None:
     found = catalogue.anchors()
     assert set(catalogue.suites()["core16"].environments) <= set(found)
-    assert {each.env for each in proofs.table()} <= set(found)
+    assert {each.env for each in proofs.table()} <= set(found), "python docs/_site/anchors.py"
     for env_id, each in found.items():
         assert each.width > 0.0, env_id
         assert (each.random.high or each.random.mean) < (each.best.low or each.best.mean), env_id

@@ -15,6 +15,7 @@ from evopolicy_common import catalogue
 from evopolicy_common.catalogue import installs
 from evopolicy_common.errors import ConfigError
 from evopolicy_worker import cli, setup
+from evopolicy_worker.environments import missing
 from evopolicy_worker.environments.browser import chromium
 
 
@@ -95,6 +96,14 @@ def test_a_browser_that_is_missing_is_named_before_anything_is_installed(
 
 @pytest.mark.slow
 @pytest.mark.system
+def test_a_browser_that_is_missing_is_all_that_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(chromium, "lacking", lambda: "Chromium")
+    monkeypatch.setattr(installs, "is_here", lambda family: True)
+    assert missing("miniwob/click-test-v1") == "Chromium"
+    monkeypatch.setattr(installs, "is_here", lambda family: False)
+    assert "or `evopolicy-worker setup miniwob`" in missing("miniwob/click-test-v1")
+
+
 def test_a_package_index_that_cannot_be_reached_is_reported(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

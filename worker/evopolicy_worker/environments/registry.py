@@ -160,8 +160,10 @@ def missing(env_id: str) -> str:
     family = family_of(entry)
     if family.installed():
         return ""
-    advice = installs.advice(env_id)
-    return f"{family.needs()}; or {advice} in an environment of its own" if advice else family.needs()
+    row = installs.family_of(env_id)
+    if not row or installs.is_here(row):
+        return family.needs()
+    return f"{family.needs()}; or {installs.advice(env_id)} in an environment of its own"
 
 
 def check_played(env_ids: Iterable[str]) -> None:
