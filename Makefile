@@ -10,7 +10,7 @@
 # make check  ruff and mypy
 # make release  builds wheel and sdist in dist/, checks them, and installs them in clean environments
 # make docs   the documentation as a site in build/site
-# make check-envs  plays every environment of every family, and writes the tables in docs/reference/environments/
+# make check-envs  plays every environment of every family, and writes the tables of documentation and catalogue that tell of them
 # make bench  what an episode costs, beside a bare loop
 # make bench-start        what one waits for before anything is played
 # make bench-peers        the same episodes through Gymnasium's vectors, Ray and Dask, where they are installed
@@ -116,7 +116,8 @@ check: install
 check-envs: install
 	@mkdir -p build
 	@$(BIN)/evopolicy-worker check-env --results build/check-envs.jsonl $(if $(ARGS),$(ARGS),"*"); status=$$?; \
-	$(BIN)/python docs/_site/environments.py build/check-envs.jsonl && exit $$status
+	for page in "environments.py build/check-envs.jsonl" "digests.py $(ARGS)" licences.py anchors.py families.py; \
+	do $(BIN)/python docs/_site/$$page || exit; done; exit $$status
 
 docs: install
 	@test -x $(BIN)/mkdocs || $(BIN)/python -m pip install -q --disable-pip-version-check -c constraints.txt -e '.[docs]'

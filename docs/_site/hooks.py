@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import posixpath
 import re
+from pathlib import Path
 from typing import Any
 
 from mkdocs.structure.files import File, Files
@@ -21,6 +22,19 @@ ROOT_PAGES = {
 FILES = {"examples/notebooks/tutorial.ipynb": "notebooks/tutorial.ipynb"}
 """Where a file that is no page stands in the site."""
 LINK = re.compile(r"(!?)\[([^\]]*)\]\(([^)\s#]+)(#[^)\s]*)?\)")
+
+
+def on_config(config: Any) -> Any:
+    """Adds the families' pages, which have the names of suites, by their titles."""
+    pages = {}
+    for path in Path(config["docs_dir"], "reference", "environments").glob("*.md"):
+        title = path.read_text("utf-8").partition("\n")[0].removeprefix("# ")
+        pages[title] = f"reference/environments/{path.name}"
+    families = [{title: pages[title]} for title in sorted(pages, key=str.casefold)]
+    next(each["Environments"] for each in config["nav"] if "Environments" in each).append(
+        {"Families": families}
+    )
+    return config
 
 
 def on_files(files: Files, config: Any) -> Files:

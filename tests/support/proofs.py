@@ -1,10 +1,8 @@
-"""The families of environments whose proof of life is tested: `tests/families/table.toml`, a row each, and the
-cases."""
+"""The families of environments whose proof of life is tested: `tests/families/table.toml`, a row each."""
 
 from __future__ import annotations
 
 import hashlib
-import json
 import tomllib
 from pathlib import Path
 
@@ -46,7 +44,7 @@ class Proof(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     @property
     def seeds(self) -> list[int]:
         """The cases that the policy is measured on."""
-        return list(json.loads((FOLDER / "cases.json").read_text())[self.family])[: self.cases]
+        return drawn(self.family)[: self.cases]
 
 
 def table() -> list[Proof]:

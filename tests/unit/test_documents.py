@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 
+import msgspec
 import pytest
 import typer
 from documents import APPS, blocks_of_commands, commands, parse
@@ -142,6 +143,26 @@ def test_the_table_of_families_is_the_catalogue_s() -> None:
         assert path.read_text("utf-8") == families["written"](path.read_text("utf-8")), (
             "python docs/_site/families.py"
         )
+
+
+def test_the_table_of_floors_and_ceilings_is_the_catalogue_s() -> None:
+    anchors = runpy.run_path(str(ROOT / "docs" / "_site" / "anchors.py"))
+    page = anchors["PAGE"].read_text("utf-8")
+    assert page == anchors["written"](page), "python docs/_site/anchors.py"
+    assert set(msgspec.json.decode(anchors["FILE"].read_bytes())) == set(catalogue.anchors())
+
+
+def test_a_family_is_in_the_files_that_contributors_are_told() -> None:
+    section = (
+        text_of("CONTRIBUTING.md").partition("## Add a family of environments\n")[2].partition("\n## ")[0]
+    )
+    words = re.findall("`([^` ]+)`", section)
+    told = {word.format(family="crafter", env="crafter_CrafterReward-v1") for word in words}
+    apart = ("CHANGELOG.md", "CONTRIBUTING.md", "tests/unit/", "tests/conformance/")
+    files = {path for path in tree() if (ROOT / path).is_file() and not path.startswith(apart)}
+    assert {
+        each for each in files if b"crafter" in each.encode() + (ROOT / each).read_bytes()
+    } == told & files
 
 
 def test_rows_of_played_environments_stay_when_others_are_played(tmp_path: Path) -> None:

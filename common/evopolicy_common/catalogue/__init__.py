@@ -62,6 +62,8 @@ class _Shipped(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     families: dict[str, str]
     environment: tuple[Entry, ...]
     suite: tuple[Suite, ...]
+    collection: tuple[Suite, ...]
+    """Suites below those of families: an environment's own numbers are those of the first suite that has it."""
 
 
 class _Family(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -74,8 +76,8 @@ class _Family(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     prefix: str = "gymnasium/"
     defaults: dict[str, Any] = {}
     """Defaults of `Entry` fields for all rows."""
-    suite: tuple[Suite, ...] = ()
-    """Further suites; the family itself is a suite of its own name."""
+    breadth: tuple[str, ...] = ()
+    """One or two of its keys, for the suite `breadth`. The family itself is a suite of its own name."""
 
     def entries(self) -> Iterable[Entry]:
         shared = {"family": self.family, "adapter": self.adapter, **self.defaults}
@@ -99,14 +101,17 @@ def _load() -> _Loaded:
     rows = {entry.id: entry for entry in shipped.environment}
     grouped = {suite.name: suite for suite in shipped.suite}
     titles = dict(shipped.families)
+    breadth: list[str] = []
     places = [item for item in (here / "families").iterdir() if item.name.endswith(".toml")]
     for place in sorted(places, key=lambda item: item.name):
         family = msgspec.convert(tomllib.loads(place.read_text("utf-8")), _Family)
         own = {entry.id: entry for entry in family.entries()}
         titles.setdefault(family.family, family.title)
         grouped[family.family] = Suite(name=family.family, title=family.title, environments=tuple(own))
-        grouped |= {suite.name: suite for suite in family.suite}
+        breadth += (f"{family.prefix}{name}" for name in family.breadth)
         rows |= {env_id: row for env_id, row in own.items() if env_id not in rows}
+    broad = Suite(name="breadth", title="Breadth", environments=tuple(breadth))
+    grouped |= {suite.name: suite for suite in (broad, *shipped.collection)}
     for name, suite in grouped.items():
         parts = [grouped[each].environments if each in grouped else (each,) for each in suite.environments]
         members = tuple(itertools.chain.from_iterable(parts))

@@ -15,14 +15,12 @@ from importlib import metadata
 from pathlib import Path
 
 from evopolicy_common.catalogue import ENTRY_POINTS
+from evopolicy_common.catalogue.installs import installs
 from evopolicy_common.errors import ConfigError
 
-_NAMES = """
-gymnasium gymnasium_robotics gym mujoco mujoco_py Box2D box2d minigrid highway_env pygame ale_py miniworld
-mo_gymnasium metaworld browsergym miniwob pettingzoo dm_control labmaze shimmy pybullet pybullet_envs nle minihack retro
-stable_retro crafter vizdoom
-"""
-SIMULATORS = tuple(_NAMES.split())
+_OTHERS = "gym mujoco_py box2d browsergym pettingzoo labmaze shimmy pybullet pybullet_envs retro"
+"""Those that no family of the catalogue imports."""
+SIMULATORS = tuple(sorted({*_OTHERS.split(), *(name for row in installs().values() for name in row.modules)}))
 """Import names, or names of their files in a Python installation."""
 
 

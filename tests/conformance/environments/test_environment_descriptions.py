@@ -197,6 +197,5 @@ def test_an_environment_survives_its_repaired_nonsense(env_id: str, warm: Warm) 
 
 @pytest.mark.parametrize("env_id", IDS)
 def test_the_definition_is_the_one_that_ships(env_id: str, warm: Warm) -> None:
-    """`python docs/_site/digests.py common/evopolicy_common/catalogue/digests.json` writes
-    the table anew."""
-    assert warm(env_id).description.digest().startswith(catalogue.digests()[env_id])
+    digest = warm(env_id).description.digest()
+    assert digest.startswith(catalogue.digests()[env_id]), f"python docs/_site/digests.py {env_id}"

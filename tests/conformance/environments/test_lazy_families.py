@@ -16,6 +16,7 @@ import proofs
 import pytest
 
 from evopolicy_common import catalogue
+from evopolicy_common.catalogue import installs
 from evopolicy_common.errors import BrokenEnvironmentError
 from evopolicy_common.messages.environment import EnvironmentDescription
 from evopolicy_worker import capabilities
@@ -24,24 +25,7 @@ from evopolicy_worker.environments.browser import page
 
 pytestmark = pytest.mark.families
 
-SIMULATORS = {
-    "box2d": {"Box2D"},
-    "mujoco": {"mujoco"},
-    "minigrid": {"minigrid"},
-    "babyai": {"minigrid"},
-    "highway": {"highway_env"},
-    "robotics": {"mujoco", "gymnasium_robotics"},
-    "atari": {"ale_py"},
-    "miniworld": {"miniworld"},
-    "mo_gymnasium": {"mo_gymnasium"},
-    "metaworld": {"mujoco", "metaworld"},
-    "nethack": {"nle", "minihack"},
-    "minihack": {"nle", "minihack"},
-    "stable_retro": {"stable_retro"},
-    "dm_control": {"mujoco", "dm_control"},
-    "crafter": {"crafter"},
-    "vizdoom": {"vizdoom"},
-}
+SIMULATORS = {name: {*row.modules} - {"gymnasium", "pygame"} for name, row in installs.installs().items()}
 """Packages that only these families' environments import."""
 MAKES = """
 import json, sys
@@ -54,6 +38,7 @@ SORTS = """
 import json, sys
 from pathlib import Path
 from evopolicy_common import catalogue
+from evopolicy_common.catalogue import installs
 from evopolicy_worker import capabilities
 _, now, later = capabilities.sorted_out(catalogue.entries(), capabilities.Cache("code", Path(sys.argv[1])))
 assert now == [] and len(later) > 390
@@ -76,7 +61,7 @@ def imported(code: str, argument: str) -> set[str]:
 @pytest.mark.parametrize("proof", proofs.together(), ids=lambda proof: proof.family)
 def test_one_family_imports_no_other(proof: proofs.Proof) -> None:
     proofs.demand(proof.env)
-    others = set().union(*SIMULATORS.values()) - SIMULATORS.get(proof.family, set())
+    others = set().union(*SIMULATORS.values()) - SIMULATORS[installs.family_of(proof.env)]
     assert imported(MAKES, proof.env) & others == set()
 
 
