@@ -20,7 +20,7 @@ import numpy as np
 
 TABLE = tomllib.loads((Path(__file__).parent / "parity.toml").read_text("utf-8"))
 Given = dict[str, Any]
-"""What a bare loop is told of an episode: `id`, `kwargs`, `seed`, `actions`."""
+"""What a bare loop is told of an episode: `id`, `kwargs`, `seed`, `actions`, `family`, `modules`."""
 Played = Iterator[tuple[Any, Any, bool, bool]]
 """Observation, reward, terminated, truncated; the first with reward None."""
 
@@ -35,6 +35,7 @@ def drawn(family: str, ids: list[str]) -> list[str]:
 def ours(family: str) -> list[dict[str, Any]]:
     """An episode of each environment of the sample: what a bare loop is told, and what was seen."""
     from evopolicy_common import catalogue
+    from evopolicy_common.catalogue import installs
     from evopolicy_common.messages.environment import Case
     from evopolicy_worker.environments import make
 
@@ -62,6 +63,7 @@ def ours(family: str) -> list[dict[str, Any]]:
             "seed": seed,
             "actions": actions,
             "family": family,
+            "modules": row.get("modules", installs.installs()[installs.family_of(env_id)].modules),
         }
         found.append({"env": env_id, "told": told, "seen": seen, "weights": weights})
     return found
@@ -70,7 +72,7 @@ def ours(family: str) -> list[dict[str, Any]]:
 def gymnasium_loop(told: Given) -> Played:
     import gymnasium
 
-    for name in TABLE["family"].get(told["family"], {}).get("modules", ()):
+    for name in told["modules"]:
         gymnasium.register_envs(importlib.import_module(name))
     env = gymnasium.make(told["id"], **told["kwargs"])
     yield env.reset(seed=told["seed"])[0], None, False, False
