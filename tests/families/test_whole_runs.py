@@ -4,6 +4,7 @@ the family renders: `evolve`, or `random` where spaces are of texts. One local c
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import proofs
 import pytest
@@ -18,10 +19,12 @@ BUDGET = 2
 
 
 @pytest.fixture(scope="module")
-def played(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Command]:
-    """The folder of the runs, and the ended command."""
+def played(tmp_path_factory: pytest.TempPathFactory, request: pytest.FixtureRequest) -> tuple[Path, Command]:
+    """The folder of the runs of the chosen families, and the ended command."""
     folder = tmp_path_factory.mktemp("runs")
-    present = [each for each in proofs.together() if not missing(each.env)]
+    items: list[Any] = [each for each in request.session.items if each.path == request.path]
+    chosen = [each.callspec.params["proof"] for each in items]
+    present = [each for each in chosen if not missing(each.env)]
     counts = ["--budget", str(BUDGET), "--validation", "1", "--heldout", "1", "--hidden-isolation", "off"]
     for agent in ("random", "evolve"):
         environments = [word for each in present if each.agent == agent for word in ("--env", each.env)]
