@@ -29,14 +29,17 @@ MAX_DIFF_LINES = 1500
 
 class TraceRow(msgspec.Struct, frozen=True, kw_only=True):
     submit: Submit
-    transition: Transition | None
+    transition: Transition | None = None
     """None for a submit without a score."""
-    evidence: Evidence | None
-    """None if the log has no evidence of it."""
-    images: tuple[Path, ...]
+    evidence: Evidence = Evidence()
+    images: tuple[Path, ...] = ()
     """Images that the agent made before this submit."""
-    video: Path | None
+    video: Path | None = None
     """The first recorded episode of its feedback; None if the run recorded none."""
+
+    @property
+    def edit(self) -> str:
+        return "" if self.transition is None else self.transition.edit
 
 
 class FileDiff(msgspec.Struct, frozen=True, kw_only=True):
@@ -66,7 +69,7 @@ def trace(run: Run) -> Trace:
         TraceRow(
             submit=submit,
             transition=transitions.get(submit.index),
-            evidence=reading.by_submit.get(submit.index),
+            evidence=reading.by_submit.get(submit.index, Evidence()),
             images=tuple(images.get(submit.index, ())),
             video=min(run.feedback(submit.index).glob("episodes/ep_*/video.mp4"), default=None),
         )

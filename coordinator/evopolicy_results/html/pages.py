@@ -196,8 +196,7 @@ def trace_page(
     checkpoints = _checkpoints(trace)
     used = run.submits[-1].consumed if run.submits else 0
     rows = submit_rows(
-        run.submits,
-        traced={row.submit.index: row for row in trace.rows},
+        trace.rows,
         folder=run.path,
         selected=best,
         may_show=True,
@@ -248,8 +247,7 @@ def _checkpoints(trace: Trace) -> dict[str, dict[str, Any]]:
         if texts := sources(trace.run, row.submit):
             same_as = labels.setdefault(repr(sorted(texts.items())), row.submit.label)
             diffs = [] if previous is None else diff(previous, texts)
-            edit = "" if row.transition is None else row.transition.edit
-            out[row.submit.label] = {"edit": edit, "same_as": same_as, "diffs": diffs, "texts": texts}
+            out[row.submit.label] = {"edit": row.edit, "same_as": same_as, "diffs": diffs, "texts": texts}
             previous = texts
     return out
 

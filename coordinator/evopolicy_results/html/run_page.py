@@ -17,7 +17,6 @@ from evopolicy_results.figures.line_chart import Line, chart
 from evopolicy_results.figures.plot import inline_svg
 from evopolicy_results.figures.timelines import Row, timeline_svg
 from evopolicy_results.html import View, part
-from evopolicy_results.reading.agent_log import Evidence
 from evopolicy_results.reading.environments import title_of
 from evopolicy_results.reading.records import Submit
 from evopolicy_results.studies.palette import Look
@@ -27,7 +26,7 @@ MAX_SUBMITS = 200
 
 
 class SubmitRow(msgspec.Struct, frozen=True, kw_only=True):
-    submit: Submit
+    traced: TraceRow
     is_best: bool
     """Whether no other submit has a higher mean train return; one submit at most."""
     is_selected: bool
@@ -35,8 +34,6 @@ class SubmitRow(msgspec.Struct, frozen=True, kw_only=True):
     """Hidden results, in words; empty where they may not be shown."""
     change: str = ""
     """What changed, in words."""
-    edit: str = ""
-    evidence: Evidence = Evidence()
     href: str = ""
     """The submit's code."""
     images: Sequence[tuple[str, str]] = ()
@@ -45,9 +42,8 @@ class SubmitRow(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def submit_rows(
-    submits: Sequence[Submit],
+    traced: Sequence[TraceRow],
     *,
-    traced: Mapping[int, TraceRow] | None = None,
     folder: Path | None = None,
     selected: int | None = None,
     may_show: bool = False,
@@ -55,30 +51,26 @@ def submit_rows(
     images: Mapping[int, Sequence[tuple[str, str]]] | None = None,
     videos: Mapping[int, str] | None = None,
 ) -> list[SubmitRow]:
-    """The rows in order. `traced` and `folder`: of a finished run; `may_show`: whether its hidden results may be shown;
-    `href`: the address of a submit's code, empty where there is none."""
-    known, by_index = traced or {}, {submit.index: submit for submit in submits}
-    means = {
-        one.index: one.mean_return for one in submits if one.status == "ok" and one.mean_return is not None
-    }
+    """The rows in order. `folder`: of a finished run; `may_show`: whether its hidden results may be shown; `href`: the
+    address of a submit's code, empty where there is none."""
+    submits = {row.submit.index: row.submit for row in traced}
+    means = {index: one.mean_return for index, one in submits.items() if one.mean_return is not None}
     best = max(means, key=lambda index: (means[index], -index), default=None)
-    starts = [submit.started_at for submit in submits]
+    starts = [submit.started_at for submit in submits.values()]
     calls = [""] * len(submits) if folder is None else model_calls.before(folder, starts)
     rows: list[SubmitRow] = []
-    for submit, words in zip(submits, calls, strict=True):
-        row, index = known.get(submit.index), submit.index
+    for row, words in zip(traced, calls, strict=True):
+        index = row.submit.index
         other = "" if folder is None else changes(folder, index)
-        texts = [_change(row) if row else "", f"workspace: {other}" if other else "", words]
+        texts = [_change(row), f"workspace: {other}" if other else "", words]
         rows.append(
             SubmitRow(
-                submit=submit,
+                traced=row,
                 is_best=index == best,
                 is_selected=may_show and index == selected,
-                outcome=_outcome(row, by_index) if row is not None and may_show else "",
+                outcome=_outcome(row, submits) if may_show else "",
                 change="; ".join(filter(None, texts)),
-                edit=row.transition.edit if row is not None and row.transition is not None else "",
-                evidence=(row.evidence if row is not None else None) or Evidence(),
-                href=href(submit),
+                href=href(row.submit),
                 images=(images or {}).get(index, ()),
                 video=(videos or {}).get(index, ""),
             )
@@ -87,14 +79,12 @@ def submit_rows(
 
 
 def _change(row: TraceRow) -> str:
-    edit = "" if row.transition is None else row.transition.edit
     lines = row.submit.changed_lines
     changed = "" if lines is None else f"{lines} line{'' if lines == 1 else 's'} changed"
-    if edit == "rollback" and row.transition is not None:
+    if row.transition is not None and row.edit == "rollback":
         return f"to the topology of s{row.transition.back_to:03d}, {changed}"
-    return {"retest": "same bytes", "data": "other files of system/ than the source bundle"}.get(
-        edit, changed
-    )
+    texts = {"retest": "same bytes", "data": "other files of system/ than the source bundle"}
+    return texts.get(row.edit, changed)
 
 
 def _outcome(row: TraceRow, by_index: Mapping[int, Submit]) -> str:
@@ -153,17 +143,17 @@ def run_view(
             title="Code phases",
             caption=f"Edit types over the {budget} train episodes. A mark stands where its submit's episodes end.",
         )
-    has_evidence = any(row.evidence.read or row.evidence.messages for row in rows)
+    has_evidence = any(row.traced.evidence.read or row.traced.evidence.messages for row in rows)
     view.parts["submits-head"] = part("submits_head", has_evidence=has_evidence)
     for row in rows[::-1][:MAX_SUBMITS] if not is_finished else rows:
-        ident = f"submit-{row.submit.index}"
+        ident = f"submit-{row.traced.submit.index}"
         view.row("submit-rows", ident, part("submit_row", ident=ident, row=row, has_evidence=has_evidence))
     return view
 
 
 def _curve(rows: Sequence[SubmitRow], budget: int, reference: tuple[str, float] | None, colour: str) -> str:
-    ok = [row.submit for row in rows if row.submit.status == "ok"]
-    points = [(float(one.consumed), one.mean_return) for one in ok if one.mean_return is not None]
+    submits = [row.traced.submit for row in rows]
+    points = [(float(one.consumed), one.mean_return) for one in submits if one.mean_return is not None]
     best = itertools.accumulate((mean for _, mean in points), max)
     rising = [(at, mean) for (at, _), mean in zip(points, best, strict=True)]
     lines = [

@@ -211,7 +211,7 @@ _FEEDBACK = (
     Column("submit", "Submit", of="each.submit.label"),
     Column("before", "Budget before", "integer", of="each.submit.consumed_before"),
     Column("after", "Budget after", "integer", of="each.submit.consumed"),
-    Column("read", "Evidence read", of=lambda one: ", ".join(getattr(one.each.evidence, "read", ())) or None),
+    Column("read", "Evidence read", of=lambda one: ", ".join(one.each.evidence.read) or None),
     Column("said", "The agent's own words", of=lambda one: _quote(one.each.evidence)),
     Column("status", "Status", of="each.submit.status"),
     Column("edit", "Edit", of="each.transition.edit"),
@@ -228,8 +228,8 @@ def submits_of(trace: Trace) -> list[dict[str, Any]]:
     return rows_of([_Of(trace.run, row) for row in trace.rows], _FEEDBACK)
 
 
-def _quote(evidence: Evidence | None) -> str:
-    quote = " ".join(evidence.attribution.split()) if evidence is not None else ""
+def _quote(evidence: Evidence) -> str:
+    quote = " ".join(evidence.attribution.split())
     return quote if len(quote) <= _MAX_QUOTE else quote[: _MAX_QUOTE - 1] + "…"
 
 

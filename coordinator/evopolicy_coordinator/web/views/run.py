@@ -20,7 +20,7 @@ from evopolicy_common.terminal import counted, duration, number
 from evopolicy_coordinator.web.content.rendering import Words, ident, part, short, state_words
 from evopolicy_coordinator.web.content.run_detail import IMAGES, MAX_WORDS, CodeFile, Detail, Happened
 from evopolicy_coordinator.web.content.run_folders import Reader, RunFacts, Runs
-from evopolicy_results.behaviour.trace import Trace, diff, trace
+from evopolicy_results.behaviour.trace import Trace, TraceRow, diff, trace
 from evopolicy_results.figures.line_chart import chart
 from evopolicy_results.html import View, notice
 from evopolicy_results.html.run_page import SubmitRow, run_view, submit_rows
@@ -47,7 +47,10 @@ def live_run_view(
     if path is None or found is not None:
         rows, traced = found or ([], None)
     else:
-        rows, traced = submit_rows(reader.submits(path), href=_address(run.key)), None
+        rows, traced = (
+            submit_rows([TraceRow(submit=one) for one in reader.submits(path)], href=_address(run.key)),
+            None,
+        )
     view = run_view(
         rows,
         entry=run.entry,
@@ -88,8 +91,7 @@ def _finished_rows(
     try:
         traced = trace(read_run(folder))
         rows = submit_rows(
-            traced.run.submits,
-            traced={row.submit.index: row for row in traced.rows},
+            traced.rows,
             folder=folder,
             selected=traced.run.record.outcome.best_submit_index,
             may_show=may_show,
