@@ -21,12 +21,11 @@ from evopolicy_common.messages.operator import (
     PlayedAs,
     Rescore,
 )
-from evopolicy_common.messages.run_settings import RunSettings
+from evopolicy_common.messages.run_settings import AllConditions
 from evopolicy_common.records.blobs import digest_of
 from evopolicy_common.records.episodes.rendered import decode
 from evopolicy_common.records.episodes.trajectory import Trajectory
 from evopolicy_common.records.policies.bundles import Bundle
-from evopolicy_common.records.run_record import ExperimentDimensions
 from evopolicy_common.wire.operator_client import DESCRIPTION_S, OperatorClient
 from evopolicy_common.wire.transport import Link
 
@@ -74,7 +73,7 @@ class Evaluations:
         indexes: Sequence[int],
         *,
         env: str,
-        conditions: ExperimentDimensions | RunSettings,
+        conditions: AllConditions,
         actions: Sequence[bytes] = (),
         bundle: Bundle | None = None,
         record: Record = "actions",
@@ -89,7 +88,9 @@ class Evaluations:
             await self.ask.upload(digest_of(data), data)
         if bundle is not None:
             await self.ask.upload(bundle.digest, bundle.packed)
-        is_random = cases.submit_index == RANDOM
+        how = conditions.conditions
+        if cases.submit_index == RANDOM:  # no policy could receive lists: recorded as arrays
+            how = msgspec.structs.replace(how, observations="arrays")
         message = Evaluate(
             key=uuid.uuid4().hex,
             env=env,
@@ -108,12 +109,7 @@ class Evaluations:
                 indexes=tuple(indexes),
                 modulo=cases.modulo,
                 remaining_budget_after=cases.remaining_budget_after,
-                policy_scope=conditions.policy_scope,
-                # Random actions had no policy that could receive lists, and are recorded as arrays.
-                observations="arrays" if is_random else conditions.observations,
-                failed_episodes=conditions.failed_episodes,
-                published=conditions.profile != "own",
-                hidden_evaluation=conditions.hidden_evaluation,
+                conditions=how,
             ),
         )
         missing = dict(enumerate(indexes))

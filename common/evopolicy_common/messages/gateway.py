@@ -66,6 +66,11 @@ class Conditions(msgspec.Struct, frozen=True, kw_only=True):
     feedback: FeedbackDetail = "pictures"
     """The agent's feedback level."""
 
+    @property
+    def conditions(self) -> Conditions:
+        """These alone, of settings with more fields."""
+        return Conditions(**{name: getattr(self, name) for name in Conditions.__struct_fields__})
+
 
 class FromGateway(Message, frozen=True, kw_only=True):
     """A request of a run's gateway."""

@@ -10,15 +10,11 @@ from evopolicy_common.messages.bounds import Bytes, Int, Many, Named, Number, Pl
 from evopolicy_common.messages.environment import (
     Case,
     EnvironmentDescription,
-    FailedEpisodes,
-    HiddenEvaluation,
-    ObservationForm,
-    PolicyScope,
     Split,
     StepLimit,
 )
 from evopolicy_common.messages.episode import BlobRef, EpisodeOutcome, Record, ResourceLimits, Tier
-from evopolicy_common.messages.gateway import SubmitStatus
+from evopolicy_common.messages.gateway import Conditions, SubmitStatus
 from evopolicy_common.messages.run_settings import HiddenIsolation, RunSettings
 from evopolicy_common.messages.status import FromOperator, StatusReply, StatusRequest
 from evopolicy_common.messages.worker import (
@@ -202,13 +198,8 @@ class PlayedAs(msgspec.Struct, frozen=True, kw_only=True):
     modulo: Int
     """Number of episodes of the checkpoint's own submit: episode indexes count modulo this."""
     remaining_budget_after: Int
-    policy_scope: PolicyScope = "episode"
-    """With `submit`, `indexes` must cover the whole list."""
-    observations: ObservationForm = "arrays"
-    failed_episodes: FailedEpisodes = "play-on"
-    published: bool = False
-    """As in `Job`."""
-    hidden_evaluation: HiddenEvaluation = "submit"
+    conditions: Conditions = Conditions()
+    """With the policy scope `submit`, `indexes` must cover the whole list."""
 
 
 class Evaluate(FromOperator, frozen=True, kw_only=True, tag="evaluate"):

@@ -234,7 +234,7 @@ class RunRequests:
         fits = len(place.indexes) == n and all(0 <= index < whole for index in place.indexes)
         fits = fits and 1 <= place.modulo <= MAX_COUNT and -1 <= place.submit_index <= MAX_COUNT
         require(fits, Refusal.BAD_MESSAGE, f"{n} cases and {whole} in their list do not match")
-        all_at_once = place.policy_scope == "submit" and m.bundle is not None
+        all_at_once = place.conditions.policy_scope == "submit" and m.bundle is not None
         text = "with policy scope submit only whole submits are played again"
         require(not all_at_once or place.indexes == tuple(range(whole)), Refusal.BAD_MESSAGE, text)
 
@@ -259,7 +259,9 @@ class RunRequests:
             raise RefusedError(Refusal.UNKNOWN_SUBMIT, f"run {of.run} has no ok submit {m.submit_index}")
         bundle = None if submit is None else submit.bundle
         check_bundle(self._blobs, bundle)
-        ids = tuple(len(of.heldout) + index for index in range(n))
+        ids, how = tuple(len(of.heldout) + index for index in range(n)), settings.conditions
+        if is_random:
+            how = replace(how, policy_scope="episode", observations="arrays")
         place = operator.PlayedAs(
             run=of.run,
             submit_index=m.submit_index,
@@ -267,15 +269,11 @@ class RunRequests:
             indexes=m.indexes,
             modulo=n if submit is None else len(submit.env_instances),
             remaining_budget_after=0 if submit is None else submit.remaining_budget,
-            policy_scope="episode" if is_random else settings.policy_scope,
-            observations="arrays" if is_random else settings.observations,
-            failed_episodes=settings.failed_episodes,
-            published=settings.profile != "own",
-            hidden_evaluation=settings.hidden_evaluation,
+            conditions=how,
         )
-        if place.policy_scope == "submit" and m.indexes != tuple(range(n)):
+        if how.policy_scope == "submit" and m.indexes != tuple(range(n)):
             raise RefusedError(Refusal.BAD_REQUEST, "with policy scope submit all cases are played at once")
-        if place.policy_scope == "submit" and place.hidden_evaluation == "pool":
+        if how.policy_scope == "submit" and how.hidden_evaluation == "pool":
             check_job(m.cases, n)
         return EvaluationRow(
             evaluation=f"e-{secrets.token_hex(8)}",

@@ -8,8 +8,8 @@ from __future__ import annotations
 from typing import Any, Literal
 
 from evopolicy_common.messages.environment import Case
+from evopolicy_common.messages.gateway import Conditions
 from evopolicy_common.messages.operator import PlayedAs
-from evopolicy_common.messages.run_settings import RunSettings
 from evopolicy_coordinator.core.contract.records import (
     EvaluationRow,
     RunRow,
@@ -101,7 +101,7 @@ def evaluation(of: Evaluation, step: Step) -> JobGroup:
     # A replayed list keeps its position in its run; any other is a list of its own.
     row, place = of.row, _place(of.row)
     counts = occurrences(place.env_instances)
-    pool = row.split in HIDDEN_SPLITS and place.hidden_evaluation == "pool"
+    pool = row.split in HIDDEN_SPLITS and place.conditions.hidden_evaluation == "pool"
     return _group(
         "evaluation",
         of,
@@ -124,7 +124,7 @@ def evaluation(of: Evaluation, step: Step) -> JobGroup:
         case_ids=row.case_ids,
         occurrences=tuple(counts[index] for index in place.indexes),
         modulo=len(place.env_instances) if pool else place.modulo,
-        scope=place.policy_scope if row.bundle is not None else "episode",
+        scope=place.conditions.policy_scope if row.bundle is not None else "episode",
         record=row.record,
         replays=row.replays,
         indexes=place.indexes,
@@ -182,14 +182,13 @@ def _group(
 def _conditions(owner: Run | Evaluation) -> dict[str, Any]:
     """How all episodes of a run or an evaluation are played."""
     row = owner.row
-    how: RunSettings | PlayedAs
+    how: Conditions
     if isinstance(row, RunRow):
         how, tier, limits = row.settings, row.settings.sandbox_tier, row.settings.limits
     else:
-        how, tier, limits = _place(row), row.tier, row.limits
+        how, tier, limits = _place(row).conditions, row.tier, row.limits
     shared = {"observations": how.observations, "failed_episodes": how.failed_episodes}
-    published = how.published if isinstance(how, PlayedAs) else how.profile != "own"
-    return {**shared, "published": published, "tier": tier, "limits": limits}
+    return {**shared, "published": how.profile != "own", "tier": tier, "limits": limits}
 
 
 def env_meta(run: Run, row: SubmitRow) -> dict[str, object]:
