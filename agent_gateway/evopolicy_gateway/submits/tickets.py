@@ -13,7 +13,7 @@ The pipeline performs one effect at a time and passes its outcome to the method 
 | is accepted          | `Collect`      | `collected`: `Note` of `Settled`, its end                                   |
 | has an entry         | `Note`         | `noted`: the effect that its next state needs                               |
 | met an error         | `Note`, `Died` | `noted`: `Stop`, which ends the process. If that happens to the next gateway |
-|                      |                | too: `Note` of `SetAside`, its end                                          |
+|                      |                | too: `Note` of `Refused`, its end                                           |
 
 State that survives the process changes in `noted` alone, when its entry is durable.
 """
@@ -57,10 +57,18 @@ class ConflictError(RequestError):
         """Index of the earlier submit."""
 
 
-class _SummaryPart(msgspec.Struct):
-    mean_return: float | str | None
+class SummaryPart(msgspec.Struct, frozen=True):
+    """The part of a summary that a gateway keeps."""
+
+    mean_return: float | str | None = None
     policy_failures: int | None = None
     warning: str | None = None
+
+    @property
+    def mean(self) -> float | None:
+        """None without returns, or when the mean is not finite."""
+        mean = self.mean_return
+        return mean if isinstance(mean, float) and math.isfinite(mean) else None
 
 
 class Ticket(msgspec.Struct, kw_only=True, eq=False):
@@ -83,12 +91,8 @@ class Ticket(msgspec.Struct, kw_only=True, eq=False):
     place: int | None = None
     """Offset of the journal's entry with its summary; None before its feedback is committed."""
     status: str | None = None
-    mean: float | None = None
-    """Mean of its returns once it is settled; None without returns, or when the mean is not finite."""
-    policy_failures: int | None = None
-    """Episodes in which the policy failed; None unless it is ok."""
-    warning: str | None = None
-    """The warning to the agent about policy failures."""
+    summary: SummaryPart = SummaryPart()
+    """Without values until it is settled."""
     error: RequestError | None = None
     """The reason for its failure or refusal."""
 
@@ -175,7 +179,7 @@ class TicketMachine:
     @property
     def last_warning(self) -> str | None:
         """The warning of the last answered submit about its policy; None when the policy did not fail."""
-        answered = (ticket.warning for ticket in reversed(self.tickets) if ticket.status is not None)
+        answered = (ticket.summary.warning for ticket in reversed(self.tickets) if ticket.status is not None)
         return next(answered, None)
 
     def finalizes(self, ticket: Ticket) -> bool:
@@ -315,18 +319,14 @@ class TicketMachine:
                 self.deaths.update((entry.key, index) for index in entry.episodes or (None,))
                 if self._failure is not None:
                     return self._after_death(self._open, self._failure)
-            case open_run.SetAside():
-                self._end(RequestError("gateway_failed", entry.message))
             case open_run.Rejected():
                 self.n_rejected += 1
         return self.next()
 
     def _settle(self, ticket: Ticket, entry: open_run.Settled, place: int) -> None:
-        decoded = msgspec.json.decode(entry.summary, type=_SummaryPart)
+        ticket.summary = msgspec.json.decode(entry.summary, type=SummaryPart)
         ticket.status, ticket.place, ticket.waits_for = entry.status, place, ""
-        ticket.policy_failures, ticket.warning = decoded.policy_failures, decoded.warning
-        mean, ticket.n_done = decoded.mean_return, ticket.n_episodes
-        ticket.mean = mean if isinstance(mean, float | int) and math.isfinite(mean) else None
+        ticket.n_done = ticket.n_episodes
         # To save memory: a run has thousands of episodes.
         ticket.request = msgspec.structs.replace(ticket.request, env_instances=())
         self._end(None)
@@ -336,7 +336,7 @@ class TicketMachine:
             return Stop(failure)
         charged = "it was not accepted" if ticket.accepted is None else "its episodes are charged and count"
         text = f"the gateway failed {MAX_DEATHS} times on this submit and gives it no feedback; {charged}"
-        return Note(open_run.SetAside(key=ticket.request.key, message=text))
+        return Note(open_run.Refused(key=ticket.request.key, status="gateway_failed", message=text))
 
     def _end(self, error: RequestError | None) -> None:
         """Ends the ticket in flight. Without acceptance it takes no index."""

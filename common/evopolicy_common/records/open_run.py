@@ -93,7 +93,8 @@ class Settled(JournalLine, frozen=True, kw_only=True, tag="settled"):
 
 
 class Refused(JournalLine, frozen=True, kw_only=True, tag="refused"):
-    """The coordinator refused it; nothing was charged."""
+    """The coordinator refused it, and nothing was charged; or the gateway failed twice on it, and it is not retried. It
+    has no feedback."""
 
     key: str
     status: str
@@ -114,12 +115,5 @@ class Died(JournalLine, frozen=True, kw_only=True, tag="died"):
     """Request indices of these episodes; empty: the submit as a whole."""
 
 
-class SetAside(JournalLine, frozen=True, kw_only=True, tag="set_aside"):
-    """A submit on which the gateway failed twice: it has no feedback and is not retried."""
-
-    key: str
-    message: str
-
-
-AnyLine = Requested | Accepted | Settled | Refused | Rejected | Died | SetAside
+AnyLine = Requested | Accepted | Settled | Refused | Rejected | Died
 line_decoder = msgspec.json.Decoder(AnyLine)

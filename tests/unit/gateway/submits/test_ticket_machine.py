@@ -23,7 +23,6 @@ from evopolicy_common.records.open_run import (
     Refused,
     Rejected,
     Requested,
-    SetAside,
     Settled,
 )
 from evopolicy_common.refusals import Refusal
@@ -170,7 +169,7 @@ class World:
         assert all(ticket.accepted for ticket in machine.tickets if ticket is not open_ticket)
         assert (self.effect is None) == (open_ticket is None)
         assert all((kind is ConflictError) == (before is not None) for kind, before in self.refusals)
-        for kinds in (Requested, Accepted, Settled | Refused | SetAside):
+        for kinds in (Requested, Accepted, Settled | Refused):
             keys = [entry.key for entry in self.journal if isinstance(entry, kinds)]
             assert len(keys) == len(set(keys))
         charged = sum(ticket.n_episodes for ticket in machine.tickets if ticket.accepted)
