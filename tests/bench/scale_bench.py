@@ -35,17 +35,17 @@ import msgspec
 import numpy as np
 from coordinator_harness import FINGERPRINT, Coordinator, operator_of
 from rich.console import Console
+from rigs.finished_run import mark_opened
 
 from evopolicy_common import catalogue
 from evopolicy_common.messages.environment import Case, EnvironmentDescription
 from evopolicy_common.messages.episode import EpisodeOutcome, Job
 from evopolicy_common.records.blobs import BlobStore
 from evopolicy_common.records.episodes import rendered
-from evopolicy_common.records.open_run import OpenedRun
 from evopolicy_common.wire import credentials, transport
 from evopolicy_coordinator.core.contract.records import RunRow, submit_group
 from evopolicy_coordinator.storage.store import Reader
-from evopolicy_gateway.run_folder.layout import RunFolder, save
+from evopolicy_gateway.run_folder.layout import RunFolder
 from evopolicy_worker import environments
 from evopolicy_worker.capabilities import Capabilities
 from evopolicy_worker.slot_protocol import slot_messages
@@ -202,7 +202,7 @@ class Run:
         self.log = root / "gateway.log"
         found = msgspec.structs.replace(coordinator.credentials("gateway"), token=capability)
         credentials.write(found, self.folder.credentials)
-        save(self.folder.opened_run, OpenedRun(run=run))
+        mark_opened(self.folder, run)
         self.said = root / "gateway.jsonl"
         pipes = {"stdin": subprocess.PIPE, "stdout": stack.enter_context(self.said.open("wb"))}
         self.process = stack.enter_context(

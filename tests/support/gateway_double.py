@@ -15,6 +15,7 @@ from typing import Any
 import httpx
 import msgspec
 import numpy as np
+from rigs.finished_run import mark_opened
 from rigs.service_world import IDENTITY, Requested, World
 
 from evopolicy_common.messages import operator, worker
@@ -43,7 +44,6 @@ from evopolicy_common.messages.run_settings import PUBLISHED, RunSettings
 from evopolicy_common.messages.worker import BlobPut, Message, Refused
 from evopolicy_common.records.blobs import digest_of
 from evopolicy_common.records.episodes.trajectory import Recorder
-from evopolicy_common.records.open_run import OpenedRun
 from evopolicy_common.records.policies import bundles
 from evopolicy_common.records.policies.bundles import BundleFile
 from evopolicy_common.wire import codec, credentials, keys, transport
@@ -51,7 +51,7 @@ from evopolicy_common.wire.credentials import Credentials
 from evopolicy_coordinator.core.contract.settings import CoreSettings
 from evopolicy_gateway.processes import child_messages
 from evopolicy_gateway.run.gateway import Gateway
-from evopolicy_gateway.run_folder.layout import RunFolder, save
+from evopolicy_gateway.run_folder.layout import RunFolder
 from evopolicy_gateway.submits.pipeline import SubmitPipeline
 from evopolicy_gateway.workspace.agents_md import Urls
 
@@ -497,7 +497,7 @@ def prepare(root: Path, found: Credentials, double: Double) -> RunFolder:
     folder = RunFolder(root)
     folder.state.mkdir(parents=True, mode=0o700, exist_ok=True)
     credentials.write(found, folder.credentials)
-    save(folder.opened_run, OpenedRun(run=double.run_id))
+    mark_opened(folder, double.run_id)
     return folder
 
 

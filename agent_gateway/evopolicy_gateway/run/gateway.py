@@ -23,7 +23,6 @@ from typing import Any
 
 from evopolicy_common.errors import ConfigError, RefusedError
 from evopolicy_common.logs import structlog
-from evopolicy_common.records.open_run import OpenedRun
 from evopolicy_common.refusals import RUN_OVER
 from evopolicy_common.wire import credentials, transport
 from evopolicy_common.wire.http import serving
@@ -74,8 +73,7 @@ class Gateway:
     async def run(self) -> bool:
         """Serves until `tell`; returns whether the run was closed. Raises errors that make serving impossible."""
         folder = self._folder
-        own, known = _load(folder)
-        run, place = known.run, agent_place(folder)
+        (own, run), place = _load(folder), agent_place(folder)
         if folder.closing.exists():
             self.tell(saved(folder.closing, CloseRun))
         async with contextlib.AsyncExitStack() as stack:
@@ -96,7 +94,8 @@ class Gateway:
                     raise
                 log.warning("the run takes no more", status=error.status, why=error.message)
                 return True
-            workspace.stage(folder, opened, address.urls(), known.agents_md)
+            text = folder.given_agents_md.read_bytes().decode() if folder.given_agents_md.exists() else ""
+            workspace.stage(folder, opened, address.urls(), text)
             pipeline = SubmitPipeline(session, opened, folder, journal, self._changed.set)
             app = make_app(pipeline, address.token, address.bearer)
             http = await stack.enter_async_context(serving(app, sock))
@@ -174,12 +173,12 @@ class Gateway:
         return None
 
 
-def _load(folder: RunFolder) -> tuple[credentials.Credentials, OpenedRun]:
-    if not folder.opened_run.exists():
+def _load(folder: RunFolder) -> tuple[credentials.Credentials, str]:
+    if not (run := folder.run):
         raise ConfigError(
-            f"{folder.root} holds no open run ({folder.state.name}/{folder.opened_run.name} is missing);"
+            f"{folder.root} holds no open run ({folder.state.name}/{folder.intended.name} names none);"
             " runs are opened by `evopolicy run`"
         )
     own = credentials.read_credentials(folder.credentials)
     credentials.check_endpoints(own)
-    return own, saved(folder.opened_run, OpenedRun)
+    return own, run

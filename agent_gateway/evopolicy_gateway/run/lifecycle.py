@@ -4,8 +4,8 @@
 |---------|---------------------------------------------|--------------------------|-------------------------|
 | `claim` | empties the folder; opens the run first     | a refusal: the earlier   | `intended.json`: the    |
 |         | where an earlier one would be lost          | run stays                | request and its key     |
-| `open`  | opens the run, or finds it again by its key | a refusal: a new folder  | `run.json`: the run;    |
-|         |                                             | is removed               | its capability          |
+| `open`  | opens the run, or finds it again by its key | a refusal: a new folder  | `intended.json`: the    |
+|         |                                             | is removed               | run; its capability     |
 | `agent` | keeps gateway, relay and agent alive until  | the agent, its budget,   | the closed run, at the  |
 |         | the gateway has closed the run              | its limits, cancellation | coordinator             |
 | `score` | waits for the scores of the hidden cases,   | the run's result         | the result, at the      |
@@ -36,7 +36,7 @@ from evopolicy_common.processes import child_process
 from evopolicy_common.processes.left_files import keep_to_owner
 from evopolicy_common.processes.preflight import LOOPBACK
 from evopolicy_common.processes.scratch import remove_tree
-from evopolicy_common.records.open_run import OpenedRun
+from evopolicy_common.records.blobs import write_atomically
 from evopolicy_common.records.run_files import read_record
 from evopolicy_common.records.run_record import RunRecord
 from evopolicy_common.wire import credentials
@@ -143,7 +143,7 @@ class RunLifecycle:
 
     async def _claim(self) -> None:
         plan, folder = self._plan, self._folder
-        if not self._new and (folder.intended.exists() or folder.opened_run.exists()):
+        if not self._new and folder.intended.exists():
             return
         self._new = True
         # Checking starts programs that try the jail, which another run's search would take for orphans.
@@ -202,15 +202,15 @@ class RunLifecycle:
 
     async def _open(self) -> None:
         folder = self._folder
-        if resumed := folder.opened_run.exists():
-            self.run = saved(folder.opened_run, OpenedRun).run
-            token = credentials.read_credentials(folder.credentials).token
+        wanted = saved(folder.intended, CreateRun)
+        if wanted.run:
+            self.run, token = wanted.run, credentials.read_credentials(folder.credentials).token
         else:
-            created = await self._operations.create(saved(folder.intended, CreateRun))
+            created = await self._operations.create(wanted)
             self.run, token = created.run, created.capability
         credentials.write(msgspec.structs.replace(self._credentials, token=token), folder.credentials)
         phase: str | None = "open"
-        if resumed:
+        if wanted.run:
             phase = await self._operations.phase_of(folder)
             if phase is None:
                 raise ConfigError(
@@ -219,7 +219,9 @@ class RunLifecycle:
                 )
             self._note(f"resumes run {self.run} in {folder.root}")
         else:
-            save(folder.opened_run, OpenedRun(run=self.run, agents_md=self._plan.texts.agents_md))
+            if text := self._plan.texts.agents_md:
+                write_atomically(folder.given_agents_md, text.encode(), mode=0o600)
+            save(folder.intended, msgspec.structs.replace(wanted, run=self.run))
             self._note(f"run {self.run} in {folder.root}")
         self._operations.watched_by(self.run, (folder.lock, folder.supervisor_lock))
         self._stopwatch = Stopwatch(folder.times)

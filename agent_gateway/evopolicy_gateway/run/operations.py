@@ -14,7 +14,6 @@ from evopolicy_common.logs import structlog
 from evopolicy_common.messages import operator as messages
 from evopolicy_common.messages.episode import EpisodeOutcome
 from evopolicy_common.processes.notices import notify_if_slow
-from evopolicy_common.records.open_run import OpenedRun
 from evopolicy_common.records.run_files import read_record
 from evopolicy_common.refusals import WRONG_SETTINGS, Refusal
 from evopolicy_common.wire import credentials
@@ -44,15 +43,15 @@ class Operations(OperatorClient):
         if self._opened is not None:
             self._opened(run, locks)
 
-    async def create(self, wanted: messages.CreateRun, run: str = "") -> messages.RunCreated:
-        """Opens a run, or `run` again; the same key returns the same run. Raises ConfigError for refused settings."""
-        message = msgspec.structs.replace(wanted, token=self._token, run=run)
+    async def create(self, wanted: messages.CreateRun) -> messages.RunCreated:
+        """Opens a run, perhaps again; the same key returns the same run. Raises ConfigError for refused settings."""
+        message = msgspec.structs.replace(wanted, token=self._token)
         try:
-            known: dict[str, Any] = {"despite": _AWAY, "timeout_s": None if run else TIMEOUT_S}
+            known: dict[str, Any] = {"despite": _AWAY, "timeout_s": None if wanted.run else TIMEOUT_S}
             created = await self._requests.until_answered("create", message, messages.RunCreated, **known)
         except RefusedError as error:
             raise _settings_error(error) from error
-        self._intended[created.run] = wanted
+        self._intended[created.run] = msgspec.structs.replace(wanted, run=created.run)
         return created
 
     async def wait(self, run: str) -> AsyncIterator[messages.RunProgress]:
@@ -75,10 +74,9 @@ class Operations(OperatorClient):
 
     async def phase_of(self, folder: RunFolder) -> str | None:
         """The phase of a folder's open run, opened again if the cluster has lost it; None when it cannot be."""
-        run = saved(folder.opened_run, OpenedRun).run
-        if folder.intended.exists():
-            self._intended[run] = saved(folder.intended, messages.CreateRun)
-        return await self.phase(run)
+        wanted = saved(folder.intended, messages.CreateRun)
+        self._intended[wanted.run] = wanted
+        return await self.phase(wanted.run)
 
     async def end_lost(self, run: str) -> str | None:
         """Cancels a run that has ended if a coordinator on an earlier backup still has it open, so that it keeps no
@@ -103,7 +101,7 @@ class Operations(OperatorClient):
             log.warning(
                 "the coordinator has lost the run, as after a restored backup; opening it again", run=run
             )
-            await self.create(self._intended[run], run)
+            await self.create(self._intended[run])
 
     async def claim(
         self,
@@ -125,13 +123,11 @@ class Operations(OperatorClient):
         Waits for the agent of a killed command, which may still be ending. Does nothing without such a run, or when the
         cluster does not know it.
         """
-        if folder.opened_run.exists():
-            run = saved(folder.opened_run, OpenedRun).run
-        elif folder.intended.exists():
+        if folder.intended.exists():
             # The coordinator may have opened it, and the command was killed before it had the answer.
-            intended = saved(folder.intended, messages.CreateRun)
+            wanted = saved(folder.intended, messages.CreateRun)
             try:
-                run = (await self.create(intended)).run
+                run = wanted.run or (await self.create(wanted)).run
             except (ConfigError, RefusedError):
                 return
         elif folder.run_json.exists():

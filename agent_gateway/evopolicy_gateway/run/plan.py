@@ -19,7 +19,6 @@ from evopolicy_common.messages.run_settings import RunSettings, Start
 from evopolicy_common.processes.preflight import check_installed, check_loopback, check_text, check_writable
 from evopolicy_common.processes.scratch import remove_tree
 from evopolicy_common.records.model_record import Level
-from evopolicy_common.records.open_run import OpenedRun
 from evopolicy_common.records.policies import trees
 from evopolicy_common.records.policies.trees import Tree
 from evopolicy_common.records.run_files import read_record
@@ -353,7 +352,7 @@ def find_start(text: str, started_in: Path) -> StartPoint:
                 f"--start-from {text}: {folder.root} belongs to another user; name a run of your own"
             )
         finished = folder.run_json.exists()
-        run = read_record(folder.root).run if finished else saved(folder.opened_run, OpenedRun).run
+        run = read_record(folder.root).run if finished else saved(folder.intended, CreateRun).run
     except OSError as error:
         raise ConfigError(
             f"--start-from {text}: no run is there: {error.strerror}; name a run directory"

@@ -17,6 +17,7 @@ import msgspec
 
 from evopolicy_common.catalogue import folder_name
 from evopolicy_common.errors import DECODE_ERRORS, ConfigError
+from evopolicy_common.messages.operator import CreateRun
 from evopolicy_common.records import model_calls, model_record, open_run
 from evopolicy_common.records.blobs import write_atomically
 from evopolicy_common.records.policies.trees import HISTORY, TREES
@@ -102,8 +103,13 @@ class RunFolder(msgspec.Struct, frozen=True):
     """The gateway's record of requests; see `journal.py`."""
     blobs = Place(open_run.BUNDLES)
     """Submitted snapshots of `system/`."""
-    opened_run = Place(open_run.OPENED)
-    """The id of the run that the folder belongs to: `OpenedRun`."""
+    given_agents_md = Place(f"{open_run.STATE}/AGENTS.md")
+    """The operator's text in place of `AGENTS.md`; missing: the standard text."""
+
+    @property
+    def run(self) -> str:
+        """The cluster's id of the open run in the folder; empty without one. ConfigError for a damaged file."""
+        return saved(self.intended, CreateRun).run if self.intended.exists() else ""
 
     @property
     def lock(self) -> Path:
@@ -118,7 +124,7 @@ class RunFolder(msgspec.Struct, frozen=True):
     supervisor_lock = Place(f"{open_run.STATE}/keeper.lock")
     """Lock of the agent supervisor while the agent may be alive, even if the command that started it was killed."""
     intended = Place(open_run.INTENDED)
-    """The request to open the run, written before it is sent: `CreateRun`."""
+    """The request to open the run, written before it is sent, and again with the id of the run: `CreateRun`."""
     session = Place(f"{open_run.STATE}/session.json")
     """A coding agent's session: `SessionState`."""
     times = Place(f"{open_run.STATE}/times.json")

@@ -31,14 +31,13 @@ from evopolicy_common.local.cluster import unless_failed
 from evopolicy_common.messages.operator import ClaimState
 from evopolicy_common.processes.scratch import remove_tree
 from evopolicy_common.records.blobs import write_atomically
-from evopolicy_common.records.open_run import OpenedRun
 from evopolicy_common.records.run_files import read_record
 from evopolicy_common.records.suite_folder import FINISHED, INDEX, PAUSED, Index, SweepRun
 from evopolicy_gateway.harnesses.coding_agents import session
 from evopolicy_gateway.processes.child_messages import AgentDoing
 from evopolicy_gateway.run.operations import Operations
 from evopolicy_gateway.run.plan import Plan
-from evopolicy_gateway.run_folder.layout import RunFolder, saved
+from evopolicy_gateway.run_folder.layout import RunFolder
 from evopolicy_gateway.suite import suite_index, sweep
 from evopolicy_gateway.suite.decisions import Decision, Facts
 from evopolicy_gateway.suite.suite_file import SuiteFile
@@ -152,8 +151,7 @@ class ClaimedSweep(Sweep):
         if decision.kind in ("resume", "finish"):
             taken = bool(claim.previous) or (others and not claim.kept)
             # A folder with the request alone gets its run when it resumes, from the coordinator or anew.
-            opened = run.folder.opened_run.exists()
-            if taken or (opened and await self._operations.phase_of(run.folder) is None):
+            if taken or (run.folder.run and await self._operations.phase_of(run.folder) is None):
                 decision = self._anew(run.name)
         elif claim.previous:
             decision = self._anew(run.name)
@@ -334,9 +332,7 @@ def _id_of(root: Path) -> str:
 def _opened(run: Plan) -> str:
     """The cluster's id of the run in the run's folder; empty for none."""
     with contextlib.suppress(OSError, EvopolicyError):
-        if run.folder.opened_run.exists():
-            return saved(run.folder.opened_run, OpenedRun).run
-        return read_record(run.folder.root).run
+        return run.folder.run or read_record(run.folder.root).run
     return ""
 
 
@@ -346,8 +342,8 @@ async def facts_of(run: Plan, index: Index, operations: Operations) -> Facts:
     folder, entry = run.folder, index.runs.get(run.name)
     with contextlib.suppress(OSError, EvopolicyError):
         return Facts(entry=entry, status=suite_index.state_of(read_record(folder.root)))
-    if folder.opened_run.exists() and folder.credentials.exists():
-        phase = await operations.phase(saved(folder.opened_run, OpenedRun).run)
+    if folder.run and folder.credentials.exists():
+        phase = await operations.phase(folder.run)
         harness = run.harness()
         has_session = harness.continues or (
             harness.resumable and session.load(folder.session).session is not None

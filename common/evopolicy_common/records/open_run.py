@@ -17,8 +17,8 @@ from evopolicy_common.records.run_record import RejectedSubmit
 STATE = ".gateway"
 """The gateway's own folder, while the run is open."""
 INTENDED = f"{STATE}/intended.json"
-"""The request to open the run: `CreateRun`. A command that was killed in between repeats it and gets the same run."""
-OPENED = f"{STATE}/run.json"
+"""The request to open the run: `CreateRun`, with `run` once it is opened. A command that was killed in between repeats
+it and gets the same run."""
 LISTENER = f"{STATE}/door.json"
 """There for a remote agent."""
 JOURNAL = f"{STATE}/journal.jsonl"
@@ -41,14 +41,6 @@ def is_held(lock: Path) -> bool:
     finally:
         os.close(fd)
     return False
-
-
-class OpenedRun(msgspec.Struct, frozen=True, kw_only=True):
-    """The run of the cluster that a folder belongs to."""
-
-    run: str
-    agents_md: str = ""
-    """The operator's text in place of `AGENTS.md`; empty: the standard text."""
 
 
 class JournalLine(msgspec.Struct, frozen=True, kw_only=True, tag_field="what"):

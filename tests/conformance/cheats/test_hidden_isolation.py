@@ -60,7 +60,7 @@ class Listening:
     @property
     def run(self) -> str:
         """The coordinator's id of the run, while it is open."""
-        return str(json.loads(self.folder.opened_run.read_bytes())["run"])
+        return self.folder.run
 
     def listens(self) -> None:
         """Waits until its agent listens."""

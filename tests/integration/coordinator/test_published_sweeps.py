@@ -46,7 +46,7 @@ def test_a_sweep_with_failed_unfinished_and_replaced_runs_is_published(sweep: Pa
     stuck = sweep / "runs/sweep/stuck/toy_line/sweep-0"
     for folder in ("workspace", "logs", ".gateway"):
         (stuck / folder).mkdir(parents=True)
-    (stuck / ".gateway/run.json").write_text('{"run": "r-1"}')
+    (stuck / ".gateway/intended.json").write_text('{"run": "r-1"}')
     good = sweep / "runs/sweep/good/toy_line/sweep-0"
     shutil.copytree(good, sweep / "runs/sweep/.attempts/good/toy_line/sweep-0.1")
     shutil.copytree(good, sweep / "runs/sweep/good/toy_line/copy")

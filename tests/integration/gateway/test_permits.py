@@ -9,9 +9,9 @@ from typing import TypeVar
 
 import pytest
 from gateway_double import Double, gateway_on, opened, prepared, served
+from rigs.finished_run import mark_opened
 
 from evopolicy_common.messages.gateway import CloseRun, OpenRun, RequestPermit
-from evopolicy_common.messages.operator import CreateRun
 from evopolicy_common.messages.run_settings import ELSEWHERE, RunSettings
 from evopolicy_common.messages.worker import Message
 from evopolicy_common.processes import proc
@@ -51,7 +51,7 @@ async def until(what: Callable[[], object]) -> None:
 def remote(folder: RunFolder, agent_host: str) -> None:
     save(folder.listener, Listener(host="127.0.0.1", port=0))
     settings = RunSettings(env="toy/line", entry="e", model="m", exp_id="x", agent_host=agent_host)
-    save(folder.intended, CreateRun(key="k", settings=settings))
+    mark_opened(folder, folder.run, settings)
 
 
 async def test_nothing_is_served_before_the_permit_and_the_operator_hears_why(tmp_path: Path) -> None:

@@ -93,8 +93,7 @@ def open_run(
     state = folder / ".gateway"
     (state / "bundles" / bundle.digest[:2]).mkdir(parents=True)
     (state / "bundles" / bundle.digest[:2] / bundle.digest).write_bytes(bundle.packed)
-    (state / "intended.json").write_bytes(msgspec.json.encode({"key": "k", "settings": wanted}))
-    (state / "run.json").write_text(json.dumps({"run": run}))
+    (state / "intended.json").write_bytes(msgspec.json.encode({"key": "k", "settings": wanted, "run": run}))
     lines = [
         {"what": "requested", "key": "one", "bundle": bundle.digest},
         {"what": "accepted", "key": "one", "submit_index": 0},

@@ -7,13 +7,14 @@ from typing import Any
 
 from evopolicy_common.messages.episode import BlobRef
 from evopolicy_common.messages.gateway import EpisodeFeedback
-from evopolicy_common.messages.operator import Committed, RunFinished, SubmitResult
+from evopolicy_common.messages.operator import Committed, CreateRun, RunFinished, SubmitResult
 from evopolicy_common.messages.run_settings import RunSettings
 from evopolicy_common.messages.worker import Fingerprint
 from evopolicy_common.records.account import run_record
 from evopolicy_common.records.run_record import RunRecord
 from evopolicy_gateway.run.plan import Plan
 from evopolicy_gateway.run.record import claims
+from evopolicy_gateway.run_folder.layout import RunFolder, save
 
 SETTINGS = RunSettings(env="toy/line", entry="evolve", model="none", exp_id="t", budget=8)
 
@@ -22,6 +23,11 @@ def plan_in(root: Path, settings: RunSettings = SETTINGS, **more: Any) -> Plan:
     """The plan of a run below `root`, named after its environment."""
     usual: dict[str, Any] = {"agent": "evolve", "runs": root, "started_in": root, "wall_limit_s": 60.0}
     return Plan(name=settings.env, settings=settings, **{**usual, **more})
+
+
+def mark_opened(folder: RunFolder, run: str = "r-1", settings: RunSettings = SETTINGS) -> None:
+    """The folder says that the cluster has opened the run."""
+    save(folder.intended, CreateRun(key="k", settings=settings, run=run))
 
 
 def played_episode(**more: Any) -> EpisodeFeedback:

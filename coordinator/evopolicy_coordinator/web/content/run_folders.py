@@ -24,7 +24,6 @@ from evopolicy_common.messages.operator import CreateRun
 from evopolicy_common.messages.run_settings import Start
 from evopolicy_common.messages.status import RunStatus
 from evopolicy_common.records import open_run
-from evopolicy_common.records.open_run import OpenedRun
 from evopolicy_common.records.policies.submits import read_submits
 from evopolicy_common.records.run_files import RUN_JSON, read_record
 from evopolicy_common.records.suite_folder import INDEX, PAUSED, Index, SweepRun
@@ -234,8 +233,7 @@ class Reader:
 
     def _open(self, folder: Path, entry: SweepRun | None, by_run: Mapping[str, RunStatus]) -> RunFacts:
         intended = _decoded(folder, open_run.INTENDED, CreateRun)
-        opened = _decoded(folder, open_run.OPENED, OpenedRun)
-        run = "" if opened is None else opened.run
+        run = "" if intended is None else intended.run
         status, submits = by_run.get(run), self.submits(folder)
         alive = _agent_alive(folder) if status is None else _may_be_alive(status)
         facts: dict[str, Any] = {**_placed(folder), "run": run, "agent_alive": alive, "budget": None}

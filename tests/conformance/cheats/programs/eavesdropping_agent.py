@@ -26,7 +26,7 @@ def fail(*what):
 sys.excepthook = fail
 with open("../.gateway/credentials.json", "rb") as file:
     stolen = msgspec.json.decode(file.read(), type=Credentials)
-with open("../.gateway/run.json", "rb") as file:
+with open("../.gateway/intended.json", "rb") as file:
     run = json.load(file)["run"]
 # Two, since what a session asks reaches its own ears.
 session, listener = (zenoh.open(transport.client_config(stolen)) for _ in range(2))

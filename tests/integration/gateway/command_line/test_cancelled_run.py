@@ -12,6 +12,8 @@ import pytest
 from commands import Command, agent, command, record_in, run_arguments, run_dir
 from waiting import wait_until
 
+from evopolicy_gateway.run_folder.layout import RunFolder
+
 pytestmark = pytest.mark.system
 
 SLOW = """
@@ -44,7 +46,7 @@ def cancelled(operator_file: Path, tmp_path: Path) -> Iterator[Command]:
 
 
 def cancel(operator_file: Path, cwd: Path, env: str = "toy_line") -> None:
-    run = json.loads((run_dir(cwd, env) / ".gateway/run.json").read_text())["run"]
+    run = RunFolder(run_dir(cwd, env)).run
     with command(cwd, "runs", "cancel", run, "--credentials", str(operator_file)) as cancelling:
         assert cancelling.finish()[0] == 0
 

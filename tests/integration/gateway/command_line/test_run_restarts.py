@@ -12,6 +12,8 @@ from commands import Plays, agent, command, ended, record_in, run_arguments, run
 from coordinator_harness import Coordinator
 from waiting import wait_until
 
+from evopolicy_gateway.run_folder.layout import RunFolder
+
 pytestmark = pytest.mark.system
 
 
@@ -46,7 +48,7 @@ def test_a_resumed_run_waits_for_a_coordinator_that_is_away(tmp_path: Path) -> N
         operator_file = tmp_path / "state/credentials/operator.json"
         arguments = run_arguments(operator_file, agent(tmp_path, "submit([0])"))
         with command(tmp_path, *arguments) as running:
-            wait_until(lambda: [*tmp_path.glob("runs/*/*/t/.gateway/run.json")])
+            wait_until(lambda: any(RunFolder(found).run for found in tmp_path.glob("runs/*/*/t")))
             running.kill_all()
         coordinator.stop()
         with command(tmp_path, *arguments, "--resume") as running:

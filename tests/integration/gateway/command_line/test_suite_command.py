@@ -399,7 +399,7 @@ async def created(*arguments):
 
 def saved(path, value):
     save(path, value)
-    if type(value).__name__ == "OpenedRun":
+    if getattr(value, "run", ""):
         os.kill(os.getpid(), 9)
 
 if sys.argv.pop(1) == "created":

@@ -12,9 +12,9 @@ from pathlib import Path
 
 import pytest
 from machines.cgroups import freezer
+from rigs.finished_run import mark_opened
 from stages.supervisor_process import TIMEOUT_S, SupervisorProcess
 
-from evopolicy_common.records.open_run import OpenedRun
 from evopolicy_gateway.processes.child_messages import (
     AgentEnded,
     AgentSurvives,
@@ -107,7 +107,7 @@ async def test_a_killed_commands_run_waits_for_its_agent(
 
     await cluster.drop(folder)
     assert cluster.asked == []
-    save(folder.opened_run, OpenedRun(run="r-1"))
+    mark_opened(folder)
     with folder.supervisor_lock.open("w") as held:
         fcntl.flock(held, fcntl.LOCK_EX)
         dropping = asyncio.create_task(cluster.drop(folder))

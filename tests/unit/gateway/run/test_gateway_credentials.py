@@ -6,10 +6,10 @@ from pathlib import Path
 
 import msgspec
 import pytest
+from rigs.finished_run import mark_opened
 
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.records.blobs import write_atomically
-from evopolicy_common.records.open_run import OpenedRun
 from evopolicy_common.wire import credentials
 from evopolicy_common.wire.credentials import Credentials, TlsFiles
 from evopolicy_gateway.run import gateway
@@ -45,13 +45,13 @@ def machines_folder(folder: Path) -> Path:
 def run(tmp_path: Path) -> RunFolder:
     folder = RunFolder(tmp_path / "run")
     folder.state.mkdir(parents=True)
-    write_atomically(folder.opened_run, msgspec.json.encode(OpenedRun(run="r-1")))
+    mark_opened(folder)
     credentials.write(RUNS_OWN, folder.credentials)
     return folder
 
 
 def test_a_gateway_speaks_with_its_runs_credentials(run: RunFolder) -> None:
-    assert gateway._load(run) == (RUNS_OWN, OpenedRun(run="r-1"))
+    assert gateway._load(run) == (RUNS_OWN, "r-1")
 
 
 def test_a_runs_secrets_do_not_cross_a_network_in_the_clear(run: RunFolder) -> None:

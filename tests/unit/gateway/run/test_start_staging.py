@@ -7,13 +7,13 @@ from pathlib import Path
 
 import pytest
 from gateway_double import opened
+from rigs.finished_run import mark_opened
 
 from evopolicy_common.errors import ConfigError
-from evopolicy_common.records.open_run import OpenedRun
 from evopolicy_common.records.policies import bundles, trees
 from evopolicy_gateway.run.plan import Plan, find_start, stage_start
 from evopolicy_gateway.run.run_options import RunOptions
-from evopolicy_gateway.run_folder.layout import RunFolder, save
+from evopolicy_gateway.run_folder.layout import RunFolder
 from evopolicy_gateway.workspace import staging
 from evopolicy_gateway.workspace.agents_md import NO_URLS
 
@@ -25,7 +25,7 @@ def parent(tmp_path: Path) -> RunFolder:
     """An open run with one submit, and hidden results beside its workspace."""
     folder = RunFolder(tmp_path / RUN)
     folder.state.mkdir(parents=True)
-    save(folder.opened_run, OpenedRun(run="r-1"))
+    mark_opened(folder)
     (folder.feedback / "submit_000").mkdir(parents=True)
     (folder.feedback / "submit_000" / "summary.json").write_text("{}")
     folder.system.mkdir()

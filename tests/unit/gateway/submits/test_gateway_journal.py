@@ -8,19 +8,19 @@ from pathlib import Path
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from rigs.finished_run import mark_opened
 
 from evopolicy_common.errors import ConfigError, StorageError
 from evopolicy_common.records.open_run import (
     Accepted,
     AnyLine,
-    OpenedRun,
     Rejected,
     Requested,
     Settled,
 )
 from evopolicy_common.records.run_record import RejectedSubmit
 from evopolicy_gateway.run_folder.journal import Journal
-from evopolicy_gateway.run_folder.layout import RunFolder, save, saved
+from evopolicy_gateway.run_folder.layout import RunFolder
 
 REQUESTED = Requested(
     key="k", client_key=None, body_digest="d", env_instances=(1, 2), bundle="b" * 64, bundle_error=None
@@ -106,9 +106,9 @@ def test_a_line_that_the_disk_refuses_is_cut_off(tmp_path: Path, monkeypatch: py
 def test_a_file_that_a_disk_has_damaged_is_reported(tmp_path: Path) -> None:
     folder = RunFolder(tmp_path)
     folder.state.mkdir()
-    save(folder.opened_run, OpenedRun(run="r-1"))
-    assert saved(folder.opened_run, OpenedRun).run == "r-1"
+    mark_opened(folder)
+    assert folder.run == "r-1"
     for damaged in (b"", b"{", b"\xff", b"[" * 100_000, b'{"run": 1}'):
-        folder.opened_run.write_bytes(damaged)
-        with pytest.raises(ConfigError, match=f"{folder.opened_run} is damaged.*--overwrite"):
-            saved(folder.opened_run, OpenedRun)
+        folder.intended.write_bytes(damaged)
+        with pytest.raises(ConfigError, match=f"{folder.intended} is damaged.*--overwrite"):
+            _ = folder.run

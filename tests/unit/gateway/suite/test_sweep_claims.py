@@ -7,12 +7,11 @@ from pathlib import Path
 
 import msgspec
 import pytest
+from rigs.finished_run import mark_opened
 from stages.sweep_stage import CODEX, EVOLVE, TOKENS, Staged, entry_of, until
 
 from evopolicy_common.errors import EvopolicyError
 from evopolicy_common.messages.operator import ClaimState
-from evopolicy_common.records.open_run import OpenedRun
-from evopolicy_gateway.run_folder.layout import save
 from evopolicy_gateway.suite import claimed, sweep
 from evopolicy_gateway.suite.decisions import Decision, Facts, decide
 
@@ -110,7 +109,7 @@ def test_a_claim_that_was_given_back_ends_the_earlier_hosts_run(staged: Staged, 
     if ours:
         folder = stage.runs[0].folder
         folder.state.mkdir(parents=True)
-        save(folder.opened_run, OpenedRun(run="r-7", agents_md=""))
+        mark_opened(folder, "r-7")
     stage.cluster.answer = lambda _: ClaimState(granted=True, holder="me", run="r-7")
     stage.play()
     assert stage.cluster.cancelled == ([] if ours else ["r-7"])
@@ -154,7 +153,7 @@ def test_an_open_run_that_the_cluster_cannot_open_again_is_attempted_anew(staged
         stage = staged(EVOLVE.format("a"))
         run = stage.runs[0]
         run.folder.state.mkdir(parents=True, exist_ok=True)
-        save(run.folder.opened_run, OpenedRun(run="r-7", agents_md=""))
+        mark_opened(run.folder, "r-7")
         stage.cluster.phase = phase
         stage.facts = Facts(opened=True, phase=None, closing=True)
         stage.play()
@@ -165,7 +164,7 @@ def test_a_claim_that_this_host_kept_is_no_reason_to_begin_anew(staged: Staged) 
     stage = staged(EVOLVE.format("a"))
     run = stage.runs[0]
     run.folder.state.mkdir(parents=True)
-    save(run.folder.opened_run, OpenedRun(run="r-8", agents_md=""))
+    mark_opened(run.folder, "r-8")
     # As of a backup from before the run's second attempt.
     stage.cluster.answer = lambda _: ClaimState(granted=True, holder="me", run="r-7", kept=True)
     stage.facts = Facts(opened=True, phase="open", closing=True)
