@@ -276,7 +276,7 @@ def _from_journal(folder: RunFolder) -> tuple[list[schema.RejectedSubmit], dict[
         return [], {}
     with contextlib.closing(Journal(folder.journal)) as journal:
         entries = journal.entries.values()
-    kept = {entry.key: entry.kept for entry in entries if isinstance(entry, Requested)}
+    kept = {entry.submit.key: entry.kept for entry in entries if isinstance(entry, Requested)}
     accepted = [entry for entry in entries if isinstance(entry, Accepted)]
     rejected = [entry.submit for entry in entries if isinstance(entry, Rejected)]
     return rejected, {entry.submit_index: kept.get(entry.key) for entry in accepted}

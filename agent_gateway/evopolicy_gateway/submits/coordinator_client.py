@@ -22,7 +22,6 @@ from evopolicy_common.logs import structlog
 from evopolicy_common.messages import gateway as messages
 from evopolicy_common.messages.episode import BlobRef
 from evopolicy_common.messages.worker import Message
-from evopolicy_common.records.open_run import Requested
 from evopolicy_common.refusals import NOT_NOW, RUN_LOST
 from evopolicy_common.wire import codec, keys
 from evopolicy_common.wire.requests import Requester
@@ -42,7 +41,6 @@ _PAST_ALL = (1 << 31) - 1
 """A cursor beyond all results."""
 LARGE_BYTES = 16 << 20
 """A larger recording is kept in a file."""
-_AS_REQUESTED = ("key", "env_instances", "bundle", "bundle_error", "tree")
 
 log: structlog.stdlib.BoundLogger = structlog.get_logger()
 
@@ -108,14 +106,10 @@ class CoordinatorClient:
     async def upload(self, digest: str, data: bytes) -> None:
         await self._requests.upload(*self._sender, digest, data)
 
-    async def submit(self, request: Requested, after: int) -> messages.SubmitAccepted:
+    async def submit(self, request: messages.Submit, after: int) -> messages.SubmitAccepted:
         """Requests an evaluation, as submit number `after`, from 0. The same request gets the same answer however often
         it is sent."""
-        message = messages.Submit(
-            **self._known,
-            **{name: getattr(request, name) for name in _AS_REQUESTED},
-            after=after,
-        )
+        message = msgspec.structs.replace(request, **self._known, after=after)
         return await self._ask("submit", message, messages.SubmitAccepted)
 
     async def results(self, submit_index: int, cursor: int, wait_s: float) -> messages.ResultsPage:

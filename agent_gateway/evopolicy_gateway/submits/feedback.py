@@ -163,7 +163,7 @@ class Collector:
         machine, ticket, scores = self.machine, self.ticket, self.scores
         await asyncio.to_thread(self.tree.begin)
         cursor, held_before = 0, machine.held_s
-        linger = Linger(len(ticket.request.env_instances), time.monotonic())
+        linger = Linger(len(ticket.request.submit.env_instances), time.monotonic())
         while True:
             wait_s = HELD_WAIT_S if ticket.waits_for else RESULTS_WAIT_S
             page = await self.client.results(self.accepted.submit_index, cursor, wait_s)

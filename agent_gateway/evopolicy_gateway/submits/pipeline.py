@@ -19,7 +19,7 @@ from typing import TypeVar
 
 from evopolicy_common.errors import RefusedError, RequestError, StorageError
 from evopolicy_common.logs import structlog
-from evopolicy_common.messages.gateway import RunOpened, SubmitAccepted, SubmitDone
+from evopolicy_common.messages.gateway import RunOpened, Submit, SubmitAccepted, SubmitDone
 from evopolicy_common.records.blobs import BlobStore
 from evopolicy_common.records.open_run import Accepted, AnyLine, Died, Requested, Settled
 from evopolicy_common.records.policies.trees import Recorder
@@ -183,7 +183,7 @@ class SubmitPipeline:
                         await asyncio.to_thread(snapshots.record_tree, snapshot, *more)
                     )
                 case Send():
-                    return machine.sent(await self._send(ticket.request, ticket.index))
+                    return machine.sent(await self._send(ticket.request.submit, ticket.index))
                 case Collect():
                     return machine.collected(*await self._collect(ticket))
                 case Note(entry):
@@ -231,10 +231,10 @@ class SubmitPipeline:
             assert ticket.requested_at is not None
             request = self._journal.read_line(ticket.requested_at)
             assert isinstance(request, Requested)
-            await self._send(request, ticket.index)
+            await self._send(request.submit, ticket.index)
             await self._client.ended(ticket.index)
 
-    async def _send(self, request: Requested, index: int) -> SubmitAccepted:
+    async def _send(self, request: Submit, index: int) -> SubmitAccepted:
         while True:
             known = request.bundle is None or request.bundle == self._uploaded
             if request.bundle is not None and not known:

@@ -217,17 +217,14 @@ class TicketMachine:
         )
         return self._begin(
             Requested(
-                key=key,
+                submit=messages.Submit(key=key, env_instances=parse(body, bounds), bundle=None),
                 client_key=client_key,
                 body_digest=digest_of(body),
-                env_instances=parse(body, bounds),
-                bundle=None,
-                bundle_error=None,
             )
         )
 
     def _begin(self, request: Requested) -> Ticket:
-        index, n = len(self.tickets), len(request.env_instances)
+        index, n = len(self.tickets), len(request.submit.env_instances)
         name = submit_id(index, self.run.episode_budget)
         self.in_flight = Ticket(request=request, index=index, submit_id=name, n_episodes=n)
         self.tickets.append(self.in_flight)
@@ -261,11 +258,12 @@ class TicketMachine:
         return Send() if self.in_flight.accepted is None else Collect()
 
     def snapshotted(self, snapshot: Snapshot) -> Note:
-        more = {"bundle_error": snapshot.error, "kept": snapshot.kept, "tree": snapshot.tree}
-        return Note(msgspec.structs.replace(self._open.request, bundle=snapshot.digest, **more))
+        request, more = self._open.request, {"bundle_error": snapshot.error, "tree": snapshot.tree}
+        submit = msgspec.structs.replace(request.submit, bundle=snapshot.digest, **more)
+        return Note(msgspec.structs.replace(request, submit=submit, kept=snapshot.kept))
 
     def sent(self, reply: messages.SubmitAccepted) -> Note:
-        return Note(open_run.Accepted(key=self._open.request.key, **msgspec.structs.asdict(reply)))
+        return Note(open_run.Accepted(key=self._open.request.submit.key, **msgspec.structs.asdict(reply)))
 
     def paged(self, page: messages.ResultsPage, n_done: int, held_before: float) -> None:
         """A page is written, `n_done` episodes in all. `held_before`: `held_s` before the first page."""
@@ -276,7 +274,9 @@ class TicketMachine:
         if done.status == CANCELLED:
             self.state = msgspec.structs.replace(self.state, remaining_budget=done.remaining_budget)
             self.close(cancelled=True)
-        settled = open_run.Settled(key=self._open.request.key, status=done.status, summary=summary.decode())
+        settled = open_run.Settled(
+            key=self._open.request.submit.key, status=done.status, summary=summary.decode()
+        )
         return Note(settled)
 
     def refused(self, error: RefusedError) -> Effect | None:
@@ -285,7 +285,7 @@ class TicketMachine:
         if over:
             self.close(cancelled=error.status == Refusal.RUN_CANCELLED)
         if self._open.accepted is None and (over or error.status in _REQUEST_STATUSES):
-            return Note(open_run.Refused(key=request.key, status=error.status, message=error.message))
+            return Note(open_run.Refused(key=request.submit.key, status=error.status, message=error.message))
         if not over:
             return self.failed(error)
         # Without an entry: if the coordinator opens the run once more, the next gateway collects the results.
@@ -296,7 +296,7 @@ class TicketMachine:
         if self._failure is not None:
             return Stop(error)
         self._failure = error
-        return Note(open_run.Died(key=self._open.request.key))
+        return Note(open_run.Died(key=self._open.request.submit.key))
 
     def noted(self, entry: AnyLine, place: int) -> Effect | None:
         """The entry is durable at that offset of the journal; returns the next effect."""
@@ -328,15 +328,16 @@ class TicketMachine:
         ticket.status, ticket.place, ticket.waits_for = entry.status, place, ""
         ticket.n_done = ticket.n_episodes
         # To save memory: a run has thousands of episodes.
-        ticket.request = msgspec.structs.replace(ticket.request, env_instances=())
+        submit = msgspec.structs.replace(ticket.request.submit, env_instances=())
+        ticket.request = msgspec.structs.replace(ticket.request, submit=submit)
         self._end(None)
 
     def _after_death(self, ticket: Ticket, failure: Exception) -> Effect:
-        if self.deaths[ticket.request.key, None] < MAX_DEATHS:
+        if self.deaths[ticket.request.submit.key, None] < MAX_DEATHS:
             return Stop(failure)
         charged = "it was not accepted" if ticket.accepted is None else "its episodes are charged and count"
         text = f"the gateway failed {MAX_DEATHS} times on this submit and gives it no feedback; {charged}"
-        return Note(open_run.Refused(key=ticket.request.key, status="gateway_failed", message=text))
+        return Note(open_run.Refused(key=ticket.request.submit.key, status="gateway_failed", message=text))
 
     def _end(self, error: RequestError | None) -> None:
         """Ends the ticket in flight. Without acceptance it takes no index."""

@@ -75,8 +75,8 @@ class Conditions(msgspec.Struct, frozen=True, kw_only=True):
 class FromGateway(Message, frozen=True, kw_only=True):
     """A request of a run's gateway."""
 
-    run: Word
-    token: Word
+    run: Word = ""
+    token: Word = ""
     """The run's capability; sent with every request and checked each time."""
 
 

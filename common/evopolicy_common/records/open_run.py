@@ -11,7 +11,7 @@ from pathlib import Path
 
 import msgspec
 
-from evopolicy_common.messages.episode import PolicyFailure
+from evopolicy_common.messages.gateway import Submit
 from evopolicy_common.records.run_record import RejectedSubmit
 
 STATE = ".gateway"
@@ -50,20 +50,14 @@ class JournalLine(msgspec.Struct, frozen=True, kw_only=True, tag_field="what"):
 class Requested(JournalLine, frozen=True, kw_only=True, tag="requested"):
     """A submit that passed the checks; written before anything of it is sent."""
 
-    key: str
-    """Idempotency key for the coordinator."""
+    submit: Submit
+    """As it is sent, but for the run and its token."""
     client_key: str | None
     """The agent's `Idempotency-Key`."""
     body_digest: str
     """SHA-256 of the request's body, hex."""
-    env_instances: tuple[int, ...]
-    bundle: str | None
-    """Digest of the snapshot; its bytes are in the blob store beside the journal."""
-    bundle_error: PolicyFailure | None
     kept: str | None = None
     """As in `Snapshot`."""
-    tree: str = ""
-    """Digest of the workspace's tree (`records/policies/trees`); empty: not recorded."""
 
 
 class Accepted(JournalLine, frozen=True, kw_only=True, tag="accepted"):

@@ -117,7 +117,7 @@ class Detail:
             except DECODE_ERRORS:
                 continue
             if isinstance(entry, Requested):
-                bundles_by_key[entry.key] = entry.bundle or entry.kept
+                bundles_by_key[entry.submit.key] = entry.submit.bundle or entry.kept
             elif isinstance(entry, Accepted) and entry.submit_index == index:
                 digest = bundles_by_key.get(entry.key)
                 return digest if digest is not None and is_digest(digest) else None

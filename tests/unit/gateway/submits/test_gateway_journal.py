@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from rigs.finished_run import mark_opened
 
 from evopolicy_common.errors import ConfigError, StorageError
+from evopolicy_common.messages.gateway import Submit
 from evopolicy_common.records.open_run import (
     Accepted,
     AnyLine,
@@ -23,7 +24,7 @@ from evopolicy_gateway.run_folder.journal import Journal
 from evopolicy_gateway.run_folder.layout import RunFolder
 
 REQUESTED = Requested(
-    key="k", client_key=None, body_digest="d", env_instances=(1, 2), bundle="b" * 64, bundle_error=None
+    submit=Submit(key="k", env_instances=(1, 2), bundle="b" * 64), client_key=None, body_digest="d"
 )
 ENTRIES: list[AnyLine] = [
     REQUESTED,

@@ -130,17 +130,17 @@ class World:
     def fulfil(self, task: Effect, outcome: str) -> Effect | None:
         ticket, machine = self.machine.in_flight, self.machine
         assert ticket is not None
-        if ticket.accepted is None and ticket.request.key in self.accepted:
+        if ticket.accepted is None and ticket.request.submit.key in self.accepted:
             outcome = "ok"  # a repeated key gets its acceptance
         if outcome == "fail":
             return machine.failed(KeyError("a bug"))
         if isinstance(task, TakeSnapshot):
             assert ticket.request not in self.journal
-            return machine.snapshotted(Snapshot(digest=f"bundle-{ticket.request.key}", error=None))
-        key = ticket.request.key
+            return machine.snapshotted(Snapshot(digest=f"bundle-{ticket.request.submit.key}", error=None))
+        key = ticket.request.submit.key
         assert ticket.request in self.journal
         assert self.sent.setdefault(key, ticket.request) == ticket.request
-        assert ticket.request.bundle
+        assert ticket.request.submit.bundle
         if isinstance(task, Send):
             assert ticket.accepted is None
             if outcome in REFUSALS:
@@ -151,7 +151,7 @@ class World:
                 self.accepted[key] = SubmitAccepted(
                     submit_index=before.n_submits,
                     first_global_episode=BUDGET - before.remaining_budget,
-                    remaining_budget=before.remaining_budget - len(ticket.request.env_instances),
+                    remaining_budget=before.remaining_budget - len(ticket.request.submit.env_instances),
                 )
             return machine.sent(self.accepted[key])
         assert ticket.accepted in self.journal
@@ -170,7 +170,7 @@ class World:
         assert (self.effect is None) == (open_ticket is None)
         assert all((kind is ConflictError) == (before is not None) for kind, before in self.refusals)
         for kinds in (Requested, Accepted, Settled | Refused):
-            keys = [entry.key for entry in self.journal if isinstance(entry, kinds)]
+            keys = [getattr(one, "submit", one).key for one in self.journal if isinstance(one, kinds)]
             assert len(keys) == len(set(keys))
         charged = sum(ticket.n_episodes for ticket in machine.tickets if ticket.accepted)
         # An acceptance may be known from the coordinator's state before its reply arrives.
@@ -192,7 +192,7 @@ def done(ticket: Ticket) -> SubmitDone:
     return SubmitDone(
         status="ok",
         n_episodes=ticket.n_episodes,
-        env_instances=ticket.request.env_instances,
+        env_instances=ticket.request.submit.env_instances,
         first_global_episode=0,
         remaining_budget=0,
         started_at=0.0,
