@@ -225,7 +225,7 @@ def going_on(job: Job, slot: Slot) -> Job:
 def prefix(job: Job, place: int = 0) -> list[float]:
     """The actions that the job goes on from."""
     packed = unpack(job).get(place)
-    return [] if packed is None else [float(each.action[0]) for each in packed.unpacked().taken]
+    return [] if packed is None else [float(action[0]) for _, action in packed.unpacked().taken]
 
 
 # A slot's processes.

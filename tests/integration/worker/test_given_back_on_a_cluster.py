@@ -128,7 +128,7 @@ class Stored:
                 job = Job(job_id="", env="", bundle="b", episodes=(), record="actions", begun=ref)
                 inline = ref.inline or self._blobs.read_blob(ref.digest)
                 job = msgspec.structs.replace(job, begun=msgspec.structs.replace(ref, inline=inline))
-                return [float(each.action[0]) for each in begun.unpack(job)[0].unpacked().taken]
+                return [float(action[0]) for _, action in begun.unpack(job)[0].unpacked().taken]
         return []
 
     def played(self, group: str) -> list[float]:

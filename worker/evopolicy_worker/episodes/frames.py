@@ -8,6 +8,7 @@ parsed as plain values and arrays, and never executed; any other bytes raise Bad
 from __future__ import annotations
 
 import datetime
+import functools
 import math
 import struct
 from collections.abc import Callable, Iterable, Iterator
@@ -94,14 +95,17 @@ def compile_writer(space: SpaceSchema) -> Writer:
     steps = [(path, _step(part, padded=True)) for path, part in leaves]
 
     def write(obs: Any) -> tuple[list[Any], int]:
-        out: list[Any] = []
+        out: list[Any] = [b""]
         for path, step in steps:
             value = obs
             for key in path:
                 value = value[key]
             step(value, out)
-        n = sum(len(part) if type(part) is bytes else part.nbytes for part in out)
-        return [REQUEST_HEADER.pack(n, ACT, 0), *out], REQUEST_HEADER.size + n
+        n = 0
+        for part in out:
+            n += len(part) if type(part) is bytes else part.nbytes
+        out[0] = REQUEST_HEADER.pack(n, ACT, 0)
+        return out, REQUEST_HEADER.size + n
 
     return write
 
@@ -234,12 +238,23 @@ def report(payload: bytes) -> Report:
 
 
 def _array(data: bytes | memoryview) -> NDArray[Any]:
-    code, ndim = struct.unpack_from("<4sI", data)
+    if len(data) < 8:
+        raise ValueError(f"an array of {len(data)} bytes")
+    # The lowest byte of the number of axes; `_form` refuses larger numbers.
+    start = 8 + 4 * data[4]
+    dtype, shape = _form(bytes(data[:start]))
+    array = np.frombuffer(data, dtype, offset=start)
+    return array if array.shape == shape else array.reshape(shape)
+
+
+@functools.lru_cache(256)
+def _form(head: bytes) -> tuple[np.dtype[Any], tuple[int, ...]]:
+    """Dtype and shape of an array by the bytes before its numbers."""
+    code, ndim = struct.unpack_from("<4sI", head)
     dtype = _DTYPES.get(code)
     if dtype is None or ndim > MAX_AXES:
         raise ValueError(f"an array of type {code!r} with {ndim} axes")
-    shape = struct.unpack_from(f"<{ndim}I", data, 8)
-    return np.frombuffer(data, dtype, offset=8 + 4 * ndim).reshape(shape)
+    return dtype, struct.unpack_from(f"<{ndim}I", head, 8)
 
 
 def _ext_hook(code: int, data: memoryview) -> Any:

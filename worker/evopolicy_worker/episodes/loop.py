@@ -281,7 +281,7 @@ class _Episode:
         if spec.replay is not None:
             if spec.replay.inline is None:
                 raise WorkerError(f"episode {spec.index} came without the recording that it plays")
-            recorded = [Returned(row.action, row.action) for row in decode(spec.replay.inline).rows()]
+            recorded = [(row.action, row.action) for row in decode(spec.replay.inline).rows()]
         course = _Course(job, self.environment, recorded)
         policy = self._begin() if job.bundle is not None and begun.failure is None else None
         unplayed = begun.failure is not None and _verdict_of_submit(job, spec, begun.failure)
@@ -442,8 +442,9 @@ def _replayed(codec: ActionCodec, actions: Sequence[Returned], then: Source | No
     def act(t: int, obs: Observation) -> tuple[Any, Any, str]:
         if then is not None and t >= len(actions):
             return then(t, obs)
-        action, invalid = codec.repair(actions[t].returned)
-        return actions[t].returned, action, INVALID if invalid else ""
+        returned, _ = actions[t]
+        action, invalid = codec.repair(returned)
+        return returned, action, INVALID if invalid else ""
 
     return act
 
@@ -458,7 +459,7 @@ def _asked(codec: ActionCodec, policy: PolicyProcess, begun: Begun) -> Source:
         if t < n_earlier:
             return earlier(t, obs)
         action, invalid = repair(returned)
-        take(Returned(returned, action))
+        take(returned, action)
         return returned, action, INVALID if invalid else ""
 
     return act

@@ -105,7 +105,12 @@ class Column:
         return self.data[t] if self.kind == "values" else self._each(lambda part: part.row(t))
 
     def rows(self) -> list[Any]:
-        return self.data.tolist() if self.kind == "scalar" else [self.row(t) for t in range(self.n)]
+        if self.kind == "scalar":
+            return list(self.data.tolist())
+        # The rows of an array of one axis would be numbers.
+        if self.kind == "array" and self.data.ndim > 1:
+            return list(self.data)
+        return [self.row(t) for t in range(self.n)]
 
     def values(self) -> Any:
         """The column in the form described at `Trajectory.obs`."""

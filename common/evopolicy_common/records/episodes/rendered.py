@@ -167,11 +167,9 @@ class Renderer(Recorder):
             obs = None
         elif self._form == "lists":
             obs = as_lists(self._obs)
-        ends = [
-            [bool(flag & bit) for flag in self._flags]
-            for bit in (trajectory.TERMINATED, trajectory.TRUNCATED)
-        ]
-        steps = (obs, columns.unpack(block["actions"]).rows(), self._rewards, *ends, self._infos)
+        _, rewards, flags, infos = map(list, zip(*self._steps, strict=True))
+        ends = [[bool(flag & bit) for flag in flags] for bit in (trajectory.TERMINATED, trajectory.TRUNCATED)]
+        steps = (obs, columns.unpack(block["actions"]).rows(), rewards, *ends, infos)
         try:
             for text in _texts(steps, first, self._rows_size):
                 self._rows_size += len(text)

@@ -203,16 +203,16 @@ def test_a_failure_by_a_limit_is_reported_as_one(slots: Slots) -> None:
 def test_the_file_of_an_episode_holds_actions_of_any_form_and_length(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    log, episode = begun.Log(tmp_path), begun.Begun([begun.Returned(3, 3)])
+    log, episode = begun.Log(tmp_path), begun.Begun([(3, 3)])
     odd = [np.arange(3, dtype=np.int8), {"a": (np.float32(0.5), "x")}, "\ud800", 2**70]
     values = [*odd, *[[0.1] * 999] * 99]
     log.begins("job", 2, episode)
     for value in values:
-        episode.add_action(begun.Returned(value, value))
+        episode.add_action(value, value)
     assert begun.recovered(tmp_path, "other") == {}
     again = begun.recovered(tmp_path, "job")[2].unpacked()
     kept: list[Any] = [3, [0, 1, 2], {"a": [0.5, "x"]}, "\\ud800", 2**70, *values[4:]]
-    assert [each.action for each in again.taken] == kept
+    assert [action for _, action in again.taken] == kept
     # With the failure after them; and on a full disk, as far as there is room.
     episode.fail(PolicyFailure(category="act_error", step_index=7, message="unlucky"))
     assert begun.recovered(tmp_path, "job")[2].failure == episode.failure
@@ -224,9 +224,9 @@ def test_the_file_of_an_episode_holds_actions_of_any_form_and_length(
     episode = begun.Begun()
     log.begins("job", 0, episode)
     for number in range(600_000):
-        episode.add_action(begun.Returned(number, number))
+        episode.add_action(number, number)
     found = begun.recovered(tmp_path, "job")[0].unpacked().taken
-    assert [each.action for each in found] == [*range(len(found))]
+    assert [action for _, action in found] == [*range(len(found))]
     assert 50_000 < len(found) < 600_000
 
 

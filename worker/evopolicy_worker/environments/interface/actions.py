@@ -114,10 +114,14 @@ class _Box(ActionCodec):
     def repair(self, raw: object) -> tuple[NDArray[Any], bool]:
         if self._fast:
             # Nearly every action of nearly every policy: right shape, within bounds.
-            right = type(raw) is np.ndarray and raw.dtype.kind == "f" and raw.shape == self._shape
-            listed = raw.tolist() if right else raw  # type: ignore[attr-defined]
-            if type(listed) is list and len(listed) == len(self._limits):
-                for value, (low, high) in zip(listed, self._limits, strict=True):
+            if type(raw) is np.ndarray and raw.dtype.kind == "f" and raw.shape == self._shape:
+                for value, (low, high) in zip(raw.tolist(), self._limits, strict=True):
+                    if not low <= value <= high:
+                        break
+                else:
+                    return raw.astype(self._dtype), False
+            elif type(raw) is list and len(raw) == len(self._limits):
+                for value, (low, high) in zip(raw, self._limits, strict=True):
                     if type(value) is not float or not low <= value <= high:
                         break
                 else:

@@ -105,6 +105,8 @@ def converter(space: gymnasium.Space[Any], hook: Hook, *, back: bool) -> Convert
 if TYPE_CHECKING:
     import gymnasium
 
+_step: Callable[..., Step] = tuple.__new__
+"""A `Step` of its class and a tuple, without the Python function that a NamedTuple's own name calls."""
 _MISSHAPEN = (TypeError, ValueError, OverflowError, AttributeError, LookupError)
 """Exceptions that values of a wrong form raise when they are read."""
 _PLAIN_WRAPPERS = {"OrderEnforcing", "PassiveEnvChecker", "TimeLimit"}
@@ -342,7 +344,8 @@ class GymnasiumEnvironment(Environment):
     def step(self, action: Any) -> Step:
         call.step = self._steps
         call.what = "step"
-        action = copied(action)
+        if type(action) is not int:
+            action = copied(action)
         if self._decode is not None:
             action = self._decode(action)
         returned = self.bare.step(action)
@@ -358,7 +361,7 @@ class GymnasiumEnvironment(Environment):
             if self._rewards is not None:
                 reward = self._rewards.scalar(reward, plain)
             truncated = bool(truncated) or self._steps >= self._limit
-            step = Step(self._observe(obs), float(reward), bool(terminated), truncated, plain)
+            step = _step(Step, (self._observe(obs), float(reward), bool(terminated), truncated, plain))
         except _MISSHAPEN as error:
             fault = trial.misshapen(returned, error, vector=self._rewards is not None)
             raise WorkerError(f"{call}, {fault}") from error

@@ -22,8 +22,9 @@ OURS = frozenset({"steps", "action_invalid", "policy_failed"})
 """Number of steps so far, and the marks of an action that was repaired, and of one in place of a failed policy's."""
 THEIRS = "environment."
 
+_KEPT = (float, bool)
 _SCALARS: dict[type, Callable[[Any], Any]] = {
-    **dict.fromkeys((float, bool), lambda value: value),
+    **dict.fromkeys(_KEPT, lambda value: value),
     int: lambda value: value if -(2**63) <= value < 2**63 else None,
     np.bool_: bool,
     **dict.fromkeys((np.float16, np.float32, np.float64), float),
@@ -35,8 +36,8 @@ def plain_info(info: Mapping[Any, Any]) -> dict[str, Any]:
     """The part of `info` that may be kept, as plain values, in the simulator's order."""
     plain: dict[str, Any] = {}
     for key, value in info.items():
-        convert = _SCALARS.get(type(value), _compound)
-        kept = convert(value)
+        kind = type(value)
+        kept = value if kind in _KEPT else _SCALARS.get(kind, _compound)(value)
         if kept is not None and _may_name(key):
             plain[key] = kept
     return plain
