@@ -245,7 +245,7 @@ class SimCoordinator:
             case Reply() | Refuse():
                 return message(effect)
             case ReadFinished():
-                return self.disk.finished[effect.run].result
+                return self.disk.finished[effect.run]
             case ReadResults():
                 row = self.disk.submits[effect.run, effect.submit_index]
                 upto = row.released if effect.upto is None or row.status is not None else effect.upto
