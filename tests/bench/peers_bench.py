@@ -2,8 +2,8 @@
 
 Each row plays the same cases of an environment with the policy of `bare_loop.py`, which costs nothing: a bare loop on
 one core; this project's second submit on as many slots as there are cores, sandboxed and up to committed feedback;
-Gymnasium's AsyncVectorEnv with one environment a core; Ray and Dask with one task an episode on one process a core. All
-but the first submit of a process are warm: imports and the making of environments are left out everywhere. Prints
+Gymnasium's AsyncVectorEnv with one environment a core; Ray, Dask and joblib with one task an episode on one process a core.
+All but the first submit of a process are warm: imports and the making of environments are left out everywhere. Prints
 versions, and times over the bare loop's; a peer that is not installed for `--python` is skipped with the reason.
 """
 
@@ -24,7 +24,7 @@ from runtime_bench import submit_time
 from evopolicy_common import __version__, catalogue
 
 HERE = Path(__file__).parent
-ENVIRONMENTS = ["gym/acrobot", "gym/reacher5", "gymnasium/MiniGrid-FourRooms-v0"]
+ENVIRONMENTS = ["gym/acrobot", "gym/reacher5", "gym/halfcheetah5", "gymnasium/MiniGrid-FourRooms-v0"]
 
 BEGIN = """
 import importlib.metadata, json, os, sys, time
@@ -75,12 +75,12 @@ if __name__ == "__main__":
     main()
 """
 TASK = """
-made = {}
-
 def episode(gymnasium_id, seed):
     import os, sys
     sys.path.insert(0, os.environ["BENCH"])
     import bare_loop
+    # In a module of the process: each task may bring this function, with globals, anew.
+    made = vars(bare_loop).setdefault("made", {})
     if gymnasium_id not in made:
         made[gymnasium_id] = bare_loop.make(gymnasium_id)
     return bare_loop.play(made[gymnasium_id], seed)
@@ -116,10 +116,21 @@ if __name__ == "__main__":
         steps = sum(client.gather(tasks))
         report("distributed", time.perf_counter() - started, steps)
 """  # noqa: E501
+JOBLIB = """
+from joblib import Parallel, delayed
+
+if __name__ == "__main__":
+    with Parallel(n_jobs=cores, pre_dispatch="all", batch_size=1) as pool:
+        pool(delayed(episode)(gymnasium_id, 1) for _ in range(4 * cores))
+        started = time.perf_counter()
+        steps = sum(pool(delayed(episode)(gymnasium_id, seed) for seed in bare_loop.seeds(n)))
+        report("joblib", time.perf_counter() - started, steps)
+"""
 PEERS = {
     "Gymnasium AsyncVectorEnv": ("gymnasium", BEGIN + VECTOR),
     "Ray": ("ray", BEGIN + RAY),
     "Dask": ("distributed", BEGIN + TASK + DASK),
+    "joblib": ("joblib", BEGIN + TASK + JOBLIB),
 }
 
 
