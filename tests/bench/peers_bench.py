@@ -3,8 +3,8 @@
 Each row plays the same cases of an environment with the policy of `bare_loop.py`, which costs nothing: a bare loop on
 one core; this project's second submit on as many slots as there are cores, sandboxed and up to committed feedback;
 Gymnasium's AsyncVectorEnv with one environment a core; Ray, Dask and joblib with one task an episode on a process a
-core. All but the first submit of a process are warm: imports and the making of environments are left out everywhere. Prints
-versions, and times over the bare loop's; a peer that is not installed for `--python` is skipped with the reason.
+core. All but the first submit of a process are warm: imports and the making of environments are left out everywhere.
+Prints versions, and times over the bare loop's; a peer that is not installed for `--python` is skipped with the reason.
 """
 
 from __future__ import annotations

@@ -3,7 +3,8 @@
 Prints, per environment of Core16 and for one of each family: the bare loop's time per step; the slot's time over the
 bare loop's with accelerations off and on, for Core16 also over the limit of `limit.py`; and a whole submit on
 two slots, from POST to committed feedback, over (bare time / 2). Then the geometric means, and the paces of web pages.
-At last a second small submit on two slots, over the bare loop on one core.
+At last a second small submit on two slots, over the bare loop on one core. The efficiency of two slots is half of the
+time of one over theirs.
 """
 
 from __future__ import annotations
@@ -134,17 +135,20 @@ def submit_time(env: str, n: int, *, accelerations: bool) -> float:
 
 
 def small_submit(env: str, n: int) -> dict[str, Any]:
-    """Seconds of the second and the next submits of `n` episodes on two slots, and of the bare loop on one core.
+    """Seconds of the second and the next submits of `n` episodes on two slots and on one, and of the bare loop on one
+    core.
 
-    The two are measured in turns, so that a machine whose speed varies is as fast for one as for the other.
+    They are measured in turns, so that a machine whose speed varies is as fast for one as for the other.
     """
     bare_s: list[float] = []
     small_s: list[float] = []
+    one_s: list[float] = []
     for _ in range(SMALL_ROUNDS):
         bare = quietly([sys.executable, str(HERE / "bare_loop.py"), env, "inf", str(n)])
         bare_s.append(json.loads(bare)["seconds"])
         small_s += agent_measured(env, n, SMALL * n, how="--small")["small_s"]
-    return {"env": env, "episodes": n, "bare_s": bare_s, "small_s": small_s}
+        one_s += agent_measured(env, n, SMALL * n, "--slots", "1", how="--small")["small_s"]
+    return {"env": env, "episodes": n, "bare_s": bare_s, "small_s": small_s, "one_s": one_s}
 
 
 def agent_measured(env: str, n: int, budget: int, *options: str, how: str = "", **environment: str) -> Any:
@@ -254,7 +258,7 @@ def tell_paces(rows: list[dict[str, Any]], console: Console) -> None:
 
 def tell_small(rows: list[dict[str, Any]], console: Console) -> None:
     headings = ["environment", "episodes", "bare ms", "submit ms", "ratio of the shortest", "of the medians"]
-    headings += ["wanted", "published software"]
+    headings += ["wanted", "published software", "efficiency of two slots"]
     table = frame.table(*headings, title="a second small submit on two slots, over the bare loop on one core")
     for row in rows:
         _, wanted, published = SMALL_SUBMITS[row["env"]]
@@ -262,7 +266,8 @@ def tell_small(rows: list[dict[str, Any]], console: Console) -> None:
         row["ratio"] = min(small) / min(bare)
         row["ratio_median"] = statistics.median(small) / statistics.median(bare)
         cells = [f"{1000 * min(bare):.0f}", f"{1000 * min(small):.0f}", f"{row['ratio']:.2f}"]
-        cells += [f"{row['ratio_median']:.2f}", str(wanted), str(published)]
+        row["efficiency"] = min(row["one_s"]) / (2 * min(small))
+        cells += [f"{row['ratio_median']:.2f}", str(wanted), str(published), f"{row['efficiency']:.2f}"]
         table.add_row(row["env"], str(row["episodes"]), *cells)
     console.print(table)
 
