@@ -46,9 +46,11 @@ VECTOR = """
 import gymnasium, numpy as np
 
 def main():
-    envs = gymnasium.vector.AsyncVectorEnv(
-        [lambda: bare_loop.make(gymnasium_id)] * cores, autoreset_mode=gymnasium.vector.AutoresetMode.DISABLED
-    )
+    makers, mode = [lambda: bare_loop.make(gymnasium_id)] * cores, gymnasium.vector.AutoresetMode.DISABLED
+    try:
+        envs = gymnasium.vector.AsyncVectorEnv(makers, autoreset_mode=mode)
+    except ValueError:  # a space that its shared memory does not know
+        envs = gymnasium.vector.AsyncVectorEnv(makers, autoreset_mode=mode, shared_memory=False)
     space = envs.single_action_space
     one = 0 if not hasattr(space, "high") else np.zeros(space.shape, dtype=space.dtype)
     action = np.stack([np.asarray(one, dtype=space.dtype)] * cores)

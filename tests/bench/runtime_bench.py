@@ -258,7 +258,7 @@ def tell_paces(rows: list[dict[str, Any]], console: Console) -> None:
 
 def tell_small(rows: list[dict[str, Any]], console: Console) -> None:
     headings = ["environment", "episodes", "bare ms", "submit ms", "ratio of the shortest", "of the medians"]
-    headings += ["wanted", "published software", "efficiency of two slots"]
+    headings += ["wanted", "published software", "two slots over one"]
     table = frame.table(*headings, title="a second small submit on two slots, over the bare loop on one core")
     for row in rows:
         _, wanted, published = SMALL_SUBMITS[row["env"]]
