@@ -36,7 +36,8 @@ def table(*headings: str, title: str | None = None) -> Table:
     """A table whose first column has words, and the others numbers."""
     made = Table(title=title)
     for number, heading in enumerate(headings):
-        made.add_column(heading, justify="right" if number else "left")
+        # Numbers may wrap in a narrow window; names that are cut short cannot be told apart.
+        made.add_column(heading, justify="right" if number else "left", no_wrap=not number)
     return made
 
 
