@@ -93,7 +93,7 @@ def main() -> None:
         rounds=(3, "runs of each revision"),
         json=(Path, "also write all numbers to this file"),
     )
-    console = Console()
+    console = frame.console()
     clones = {"then": installed(options.revision, console), "now": ROOT}
     found: dict[str, dict[str, list[list[float]]]] = {}
     columns = ("then, s", "now, s", "now over then", "spread")

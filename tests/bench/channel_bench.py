@@ -107,7 +107,7 @@ def main() -> None:
         gap_envs=(list(ACTIONS), "environments of the gaps", ACTIONS),
         seed=(0, "of their order and cases"),
     )
-    console = Console()
+    console = frame.console()
     with tempfile.TemporaryDirectory(prefix="evopolicy-channels-") as name:
         folder = Path(name)
         (folder / "slots").mkdir()

@@ -5,9 +5,11 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import sys
 from pathlib import Path
 from typing import Any
 
+from rich.console import Console
 from rich.table import Table
 
 
@@ -32,12 +34,16 @@ def options(doc: str | None, **known: tuple[Any, ...]) -> argparse.Namespace:
     return parser.parse_args()
 
 
+def console() -> Console:
+    """As wide as the terminal; without one, wide enough for names, which its 80 columns would cut."""
+    return Console(width=None if sys.stdout.isatty() else 160)
+
+
 def table(*headings: str, title: str | None = None) -> Table:
     """A table whose first column has words, and the others numbers."""
     made = Table(title=title)
     for number, heading in enumerate(headings):
-        # Numbers may wrap in a narrow window; names that are cut short cannot be told apart.
-        made.add_column(heading, justify="right" if number else "left", no_wrap=not number)
+        made.add_column(heading, justify="right" if number else "left")
     return made
 
 

@@ -18,7 +18,6 @@ from pathlib import Path
 from typing import Any
 
 import frame
-from rich.console import Console
 from runtime_bench import submit_time
 
 from evopolicy_common import __version__, catalogue
@@ -168,7 +167,7 @@ def main() -> None:
         json=(Path, "also write all numbers to this file"),
     )
 
-    console, n = Console(), options.episodes
+    console, n = frame.console(), options.episodes
     found: dict[str, dict[str, Any]] = {}
     versions: dict[str, str] = {"evopolicy": f"evopolicy {__version__}"}
     skipped: dict[str, str] = {

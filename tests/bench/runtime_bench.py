@@ -283,7 +283,7 @@ def main() -> None:
         small_only=(False, "only the second small submits"),
         json=(Path, "also write all numbers to this file"),
     )
-    console = Console()
+    console = frame.console()
     envs = catalogue.resolve(options.env)
     small = [] if options.slots_only else [env for env in SMALL_SUBMITS if env in envs]
     if options.small_only:

@@ -31,7 +31,6 @@ import frame
 from bare_loop import POLICY
 from coordinator_harness import Coordinator
 from invented.study import AGENTS, write_suite
-from rich.console import Console
 from stages.model_api import ModelApi
 
 from evopolicy_common import catalogue
@@ -270,7 +269,7 @@ def main() -> None:
         folder = Path(name)
         chosen = [workers] * options.workers_only + [relay] * options.relay_only
         found = [row for each in chosen for row in each(folder, options.times)] or rows(folder, options.times)
-    console = Console()
+    console = frame.console()
     console.print(
         f"seconds, {os.cpu_count()} cores, load {os.getloadavg()[0]:.1f}; over floor: CPU, or wall where there is no"
         " other"
