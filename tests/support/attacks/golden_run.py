@@ -209,9 +209,9 @@ class GoldenRun:
     @property
     def run(self) -> str:
         """The coordinator's id of the run."""
-        opened = self.folder / ".gateway" / "run.json"
-        if opened.exists():
-            self._run = str(json.loads(opened.read_bytes())["run"])
+        intended = self.folder / ".gateway" / "intended.json"
+        if intended.exists() and (run := json.loads(intended.read_bytes()).get("run")):
+            self._run = str(run)
         return self._run
 
     def _at_work(self, process: subprocess.Popen[bytes], file: str) -> bool:
