@@ -17,7 +17,9 @@ import asyncio
 import contextlib
 import hashlib
 import json
+import math
 import os
+import statistics
 import subprocess
 import sys
 import tempfile
@@ -412,8 +414,8 @@ def answered(
         "episodes_per_s": round(rate, 1),
         "feedback_mb_per_s": round(rate * played.kilobytes / 1000, 1),
         "disk_kb": round(written / episodes / 1000, 1),
-        "p50_ms": round(1000 * latencies[len(latencies) // 2], 1),
-        "p99_ms": round(1000 * latencies[int(0.99 * (len(latencies) - 1))], 1),
+        "p50_ms": round(1000 * statistics.median(latencies), 1),
+        "p99_ms": round(1000 * latencies[math.ceil(0.99 * len(latencies)) - 1], 1),
         **{f"{what}_ms": round(value, 3) for what, value in cpu_ms.items()},
         # A slot takes longer than the environment alone, so these are the fewest.
         "slots_by_gateway": round(bare_ms / max(cpu_ms["gateway"], 1e-3), 1),
