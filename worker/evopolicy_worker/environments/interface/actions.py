@@ -355,9 +355,7 @@ class _Graph(ActionCodec):
 
 def copied(action: Any) -> Any:
     """The same valid action for the simulator alone: some change theirs in place, and what was sent is recorded."""
-    if type(action) is np.ndarray:
-        return action.copy()
-    return action if type(action) is int else copy.deepcopy(action)
+    return action.copy() if type(action) is np.ndarray else copy.deepcopy(action)
 
 
 _CODECS: dict[str, Callable[[SpaceSchema], ActionCodec]] = {
