@@ -160,12 +160,12 @@ def _page(
     videos: dict[int, str] = {}
     try:
         traced = trace(run)
-        for row in traced.rows:
-            stem, index = f"{name}/{row.submit.label}", row.submit.index
-            for number, path in enumerate(row.images):
+        for submit in run.submits:
+            stem, index = f"{name}/{submit.label}", submit.index
+            for number, path in enumerate(traced.images.get(index, ())):
                 if copied := _copied(path, folder, f"{stem}-{number}"):
                     image_links.setdefault(index, []).append((path.name, copied))
-            if row.video is not None and (copied := _copied(row.video, folder, stem)):
+            if (video := traced.videos.get(index)) and (copied := _copied(video, folder, stem)):
                 videos[index] = copied
         text = trace_page(traced, look=look, image_links=image_links, videos=videos, beside=beside)
         write_file(folder / f"{name}.html", text)

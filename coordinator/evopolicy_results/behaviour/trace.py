@@ -1,18 +1,20 @@
 """Feedback use, submit by submit (paper, "feedback-utilization traces"): evidence read, change made, outcome seen.
 
-One `TraceRow` per submit: what the agent read and wrote since the previous submit (`agent_log`, if the log shows it),
-how the policy changed, and the result. Sources and images stay on disk until a page needs them.
+Of each submit: what the agent read and wrote since the previous submit (`agent_log`, if the log shows it), and how
+the policy changed. Sources and images stay on disk until a page needs them.
 """
 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 import msgspec
 
 from evopolicy_common.processes.left_files import left_files
+from evopolicy_common.records import model_calls
+from evopolicy_common.records.policies.trees import changes
 from evopolicy_common.regular_files import read_regular
 from evopolicy_results.behaviour.edits import Transition, classify
 from evopolicy_results.code.sources import read_python_files, unified
@@ -27,21 +29,6 @@ MAX_DIFF_LINES = 1500
 """Maximum number of kept lines of one diff; the others are counted."""
 
 
-class TraceRow(msgspec.Struct, frozen=True, kw_only=True):
-    submit: Submit
-    transition: Transition | None = None
-    """None for a submit without a score."""
-    evidence: Evidence = Evidence()
-    images: tuple[Path, ...] = ()
-    """Images that the agent made before this submit."""
-    video: Path | None = None
-    """The first recorded episode of its feedback; None if the run recorded none."""
-
-    @property
-    def edit(self) -> str:
-        return "" if self.transition is None else self.transition.edit
-
-
 class FileDiff(msgspec.Struct, frozen=True, kw_only=True):
     """One file's unified diff, three lines of context."""
 
@@ -53,8 +40,18 @@ class FileDiff(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Trace(msgspec.Struct, frozen=True, kw_only=True):
+    """A run's log and files by submit index, where there is anything of the submit."""
+
     run: Run
-    rows: tuple[TraceRow, ...]
+    transitions: Mapping[int, Transition]
+    """Of the submits with a score, in their order."""
+    evidence: Mapping[int, Evidence]
+    work: Mapping[int, str]
+    """In words, changes of the workspace outside `system/` before a submit, and calls of the model."""
+    images: Mapping[int, Sequence[Path]]
+    """Images that the agent made before a submit."""
+    videos: Mapping[int, Path]
+    """The first recorded episode of a submit's feedback."""
     unplaced: tuple[str, ...]
     """Messages of the agent that belong to no known submit."""
 
@@ -63,19 +60,22 @@ def trace(run: Run) -> Trace:
     """Reads the run's log and finds its images."""
     log = run.record.artifacts.logs_agent
     reading = read_agent_log(run.path / log, run.submits) if log else LogReading()
-    transitions = {t.index: t for t in classify(run.submits)}
-    images = _images(run, reading)
-    rows = [
-        TraceRow(
-            submit=submit,
-            transition=transitions.get(submit.index),
-            evidence=reading.by_submit.get(submit.index, Evidence()),
-            images=tuple(images.get(submit.index, ())),
-            video=min(run.feedback(submit.index).glob("episodes/ep_*/video.mp4"), default=None),
-        )
-        for submit in run.submits
-    ]
-    return Trace(run=run, rows=tuple(rows), unplaced=reading.unplaced)
+    indices = [submit.index for submit in run.submits]
+    videos = {index: sorted(run.feedback(index).glob("episodes/ep_*/video.mp4")) for index in indices}
+    calls = model_calls.before(run.path, [submit.started_at for submit in run.submits])
+    outside = [f"workspace: {text}" if (text := changes(run.path, index)) else "" for index in indices]
+    return Trace(
+        run=run,
+        transitions={each.index: each for each in classify(run.submits)},
+        evidence=reading.by_submit,
+        work={
+            index: "; ".join(filter(None, texts))
+            for index, *texts in zip(indices, outside, calls, strict=True)
+        },
+        images=_images(run, reading),
+        videos={index: paths[0] for index, paths in videos.items() if paths},
+        unplaced=reading.unplaced,
+    )
 
 
 def sources(run: Run, submit: Submit) -> dict[str, str]:

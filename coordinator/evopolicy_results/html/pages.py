@@ -15,7 +15,7 @@ from evopolicy_common.terminal import number
 from evopolicy_results.behaviour.trace import Trace, diff, sources
 from evopolicy_results.figures.plot import Plot
 from evopolicy_results.html import notice, page, section, visible
-from evopolicy_results.html.run_page import run_view, submit_rows
+from evopolicy_results.html.run_page import run_view
 from evopolicy_results.reading.environments import grouped, title_of
 from evopolicy_results.reading.records import Run
 from evopolicy_results.studies.answers import answers_of
@@ -195,17 +195,13 @@ def trace_page(
     closed = in_words(outcome.closed_reason)
     checkpoints = _checkpoints(trace)
     used = run.submits[-1].consumed if run.submits else 0
-    rows = submit_rows(
-        trace.rows,
-        folder=run.path,
-        selected=best,
+    view = run_view(
+        run.submits,
+        trace,
         may_show=True,
         href=lambda submit: f"#{submit.label}-source" if submit.label in checkpoints else "",
         images=image_links,
         videos=videos,
-    )
-    view = run_view(
-        rows,
         entry=run.entry,
         env=run.env,
         look=look,
@@ -220,7 +216,6 @@ def trace_page(
             ("rejected requests", "–" if run.is_published else len(record.rejected_submits)),
         ],
         budget=run.budget,
-        trace=trace,
     )
     lead = [f"Run {record.exp_id}", f"repeat {record.repeat}", f"harness {run.harness}"]
     lead += [f"policy scope {record.experiment_dimensions.policy_scope}"]
@@ -243,11 +238,12 @@ def _checkpoints(trace: Trace) -> dict[str, dict[str, Any]]:
     out: dict[str, dict[str, Any]] = {}
     previous: dict[str, str] | None = None
     labels: dict[str, str] = {}
-    for row in trace.rows:
-        if texts := sources(trace.run, row.submit):
-            same_as = labels.setdefault(repr(sorted(texts.items())), row.submit.label)
+    for submit in trace.run.submits:
+        if texts := sources(trace.run, submit):
+            same_as = labels.setdefault(repr(sorted(texts.items())), submit.label)
             diffs = [] if previous is None else diff(previous, texts)
-            out[row.submit.label] = {"edit": row.edit, "same_as": same_as, "diffs": diffs, "texts": texts}
+            edit = trace.transitions[submit.index].edit if submit.index in trace.transitions else ""
+            out[submit.label] = {"edit": edit, "same_as": same_as, "diffs": diffs, "texts": texts}
             previous = texts
     return out
 

@@ -5,18 +5,16 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from pathlib import Path
 
-import msgspec
 from markupsafe import Markup
 
-from evopolicy_common.records import model_calls
-from evopolicy_common.records.policies.trees import changes
-from evopolicy_results.behaviour.trace import Trace, TraceRow
+from evopolicy_results.behaviour.edits import Transition
+from evopolicy_results.behaviour.trace import Trace
 from evopolicy_results.figures.line_chart import Line, chart
 from evopolicy_results.figures.plot import inline_svg
 from evopolicy_results.figures.timelines import Row, timeline_svg
 from evopolicy_results.html import View, part
+from evopolicy_results.reading.agent_log import Evidence
 from evopolicy_results.reading.environments import title_of
 from evopolicy_results.reading.records import Submit
 from evopolicy_results.studies.palette import Look
@@ -25,70 +23,18 @@ MAX_SUBMITS = 200
 """Submits that a page of the live view lists, the newest."""
 
 
-class SubmitRow(msgspec.Struct, frozen=True, kw_only=True):
-    traced: TraceRow
-    is_best: bool
-    """Whether no other submit has a higher mean train return; one submit at most."""
-    is_selected: bool
-    outcome: str
-    """Hidden results, in words; empty where they may not be shown."""
-    change: str = ""
-    """What changed, in words."""
-    href: str = ""
-    """The submit's code."""
-    images: Sequence[tuple[str, str]] = ()
-    """Names and addresses."""
-    video: str = ""
-
-
-def submit_rows(
-    traced: Sequence[TraceRow],
-    *,
-    folder: Path | None = None,
-    selected: int | None = None,
-    may_show: bool = False,
-    href: Callable[[Submit], str],
-    images: Mapping[int, Sequence[tuple[str, str]]] | None = None,
-    videos: Mapping[int, str] | None = None,
-) -> list[SubmitRow]:
-    """The rows in order. `folder`: of a finished run; `may_show`: whether its hidden results may be shown; `href`: the
-    address of a submit's code, empty where there is none."""
-    submits = {row.submit.index: row.submit for row in traced}
-    means = {index: one.mean_return for index, one in submits.items() if one.mean_return is not None}
-    best = max(means, key=lambda index: (means[index], -index), default=None)
-    starts = [submit.started_at for submit in submits.values()]
-    calls = [""] * len(submits) if folder is None else model_calls.before(folder, starts)
-    rows: list[SubmitRow] = []
-    for row, words in zip(traced, calls, strict=True):
-        index = row.submit.index
-        other = "" if folder is None else changes(folder, index)
-        texts = [_change(row), f"workspace: {other}" if other else "", words]
-        rows.append(
-            SubmitRow(
-                traced=row,
-                is_best=index == best,
-                is_selected=may_show and index == selected,
-                outcome=_outcome(row, submits) if may_show else "",
-                change="; ".join(filter(None, texts)),
-                href=href(row.submit),
-                images=(images or {}).get(index, ()),
-                video=(videos or {}).get(index, ""),
-            )
-        )
-    return rows
-
-
-def _change(row: TraceRow) -> str:
-    lines = row.submit.changed_lines
+def _change(submit: Submit, transition: Transition | None) -> str:
+    lines = submit.changed_lines
     changed = "" if lines is None else f"{lines} line{'' if lines == 1 else 's'} changed"
-    if row.transition is not None and row.edit == "rollback":
-        return f"to the topology of s{row.transition.back_to:03d}, {changed}"
+    if transition is not None and transition.edit == "rollback":
+        return f"to the topology of s{transition.back_to:03d}, {changed}"
     texts = {"retest": "same bytes", "data": "other files of system/ than the source bundle"}
-    return texts.get(row.edit, changed)
+    return texts.get("" if transition is None else transition.edit, changed)
 
 
-def _outcome(row: TraceRow, by_index: Mapping[int, Submit]) -> str:
-    value, transition = row.submit.val_mean, row.transition
+def _outcome(submit: Submit, transition: Transition | None, by_index: Mapping[int, Submit]) -> str:
+    """Its hidden results in words; empty without any."""
+    value = submit.val_mean
     if value is None:
         return ""
     before = (
@@ -100,8 +46,13 @@ def _outcome(row: TraceRow, by_index: Mapping[int, Submit]) -> str:
 
 
 def run_view(
-    rows: Sequence[SubmitRow],
+    submits: Sequence[Submit],
+    trace: Trace | None = None,
     *,
+    may_show: bool = False,
+    href: Callable[[Submit], str],
+    images: Mapping[int, Sequence[tuple[str, str]]] | None = None,
+    videos: Mapping[int, str] | None = None,
     entry: str,
     env: str,
     look: Look | None,
@@ -110,10 +61,15 @@ def run_view(
     budget: int = 0,
     reference: tuple[str, float] | None = None,
     is_finished: bool = True,
-    trace: Trace | None = None,
     lists: Sequence[str] = (),
 ) -> View:
-    """The parts that the page has in a report and in the live view. `lists`: of further parts."""
+    """The parts that the page has in a report and in the live view.
+
+    `trace`: of a run that a report can read; `may_show`: whether its hidden results may be shown. `href`: the address
+    of a submit's code, empty where there is none; `images` (names and addresses) and `videos`: by submit index.
+    `lists`: of further parts.
+    """
+    transitions = {} if trace is None else trace.transitions
     view = View("submit-rows", *lists)
     view.parts |= {
         "look": part("identity", entry=entry, look=look, env_title=title_of(env)),
@@ -122,18 +78,14 @@ def run_view(
         "curve": part(
             "figure",
             ident="curve",
-            svg=Markup(_curve(rows, budget, reference, "" if look is None else look.colour)),
+            svg=Markup(_curve(submits, budget, reference, "" if look is None else look.colour)),
             empty="No submit was ok." if is_finished else "No submit has a verdict yet.",
             title="Train returns over budget",
             caption="Mean train return of every ok submit, and the best so far.",
         ),
     }
-    transitions = (
-        [] if trace is None else [row.transition for row in trace.rows if row.transition is not None]
-    )
-    if trace is not None and transitions:
-        submits, budget = trace.run.submits, trace.run.budget
-        phases = Row(transitions=transitions, budget=budget, submits=submits)
+    if may_show and transitions:
+        phases = Row(transitions=list(transitions.values()), budget=budget, submits=submits)
         label = f"Code phases of {len(submits)} submits over {budget} episodes"
         view.parts["phases"] = part(
             "figure",
@@ -143,16 +95,35 @@ def run_view(
             title="Code phases",
             caption=f"Edit types over the {budget} train episodes. A mark stands where its submit's episodes end.",
         )
-    has_evidence = any(row.traced.evidence.read or row.traced.evidence.messages for row in rows)
+    evidence = {} if trace is None else trace.evidence
+    has_evidence = any(each.read or each.messages for each in evidence.values())
     view.parts["submits-head"] = part("submits_head", has_evidence=has_evidence)
-    for row in rows[::-1][:MAX_SUBMITS] if not is_finished else rows:
-        ident = f"submit-{row.traced.submit.index}"
-        view.row("submit-rows", ident, part("submit_row", ident=ident, row=row, has_evidence=has_evidence))
+    by_index = {one.index: one for one in submits}
+    means = {one.index: one.mean_return for one in submits if one.mean_return is not None}
+    best = max(means, key=lambda index: (means[index], -index), default=None)
+    selected = trace.run.record.outcome.best_submit_index if trace is not None and may_show else None
+    for one in submits[::-1][:MAX_SUBMITS] if not is_finished else submits:
+        ident, transition = f"submit-{one.index}", transitions.get(one.index)
+        change = [_change(one, transition), "" if trace is None else trace.work[one.index]]
+        row = part(
+            "submit_row",
+            ident=ident,
+            submit=one,
+            edit="" if transition is None else transition.edit,
+            change="; ".join(filter(None, change)),
+            outcome=_outcome(one, transition, by_index) if may_show else "",
+            is_best=one.index == best,
+            is_selected=one.index == selected,
+            href=href(one),
+            clip=(videos or {}).get(one.index, ""),
+            evidence=evidence.get(one.index, Evidence()) if has_evidence else None,
+            images=(images or {}).get(one.index, ()),
+        )
+        view.row("submit-rows", ident, row)
     return view
 
 
-def _curve(rows: Sequence[SubmitRow], budget: int, reference: tuple[str, float] | None, colour: str) -> str:
-    submits = [row.traced.submit for row in rows]
+def _curve(submits: Sequence[Submit], budget: int, reference: tuple[str, float] | None, colour: str) -> str:
     points = [(float(one.consumed), one.mean_return) for one in submits if one.mean_return is not None]
     best = itertools.accumulate((mean for _, mean in points), max)
     rising = [(at, mean) for (at, _), mean in zip(points, best, strict=True)]

@@ -13,7 +13,7 @@ from msgspec.structs import replace
 
 from evopolicy_common import catalogue
 from evopolicy_results.behaviour.audit import PHASES
-from evopolicy_results.behaviour.edits import classify, demand_of
+from evopolicy_results.behaviour.edits import Transition, classify, demand_of
 from evopolicy_results.behaviour.trace import Trace
 from evopolicy_results.reading.agent_log import Evidence
 from evopolicy_results.reading.environments import (
@@ -23,7 +23,7 @@ from evopolicy_results.reading.environments import (
     ordered_environments,
     title_of,
 )
-from evopolicy_results.reading.records import Run, path_text
+from evopolicy_results.reading.records import Run, Submit, path_text
 from evopolicy_results.studies.study import Study
 from evopolicy_results.tables.table import Column, Kind, Table, at, rows_of, tabulated
 
@@ -197,10 +197,12 @@ def _environments(runs: Iterable[Run]) -> Table:
 
 
 class _Of(NamedTuple):
-    """A submit's row of a trace, with its run."""
+    """A submit, with what its run's trace has of it."""
 
     run: Run
-    each: Any
+    submit: Submit
+    transition: Transition | None
+    evidence: Evidence
 
 
 _YES_NO = {True: "yes", False: "no"}
@@ -208,24 +210,28 @@ _FEEDBACK = (
     Column("env", "Environment", of=lambda one: title_of(one.run.env)),
     Column("entry", "Agent", of="run.entry"),
     Column("run", "Run", of=lambda one: _short(one.run.name)),
-    Column("submit", "Submit", of="each.submit.label"),
-    Column("before", "Budget before", "integer", of="each.submit.consumed_before"),
-    Column("after", "Budget after", "integer", of="each.submit.consumed"),
-    Column("read", "Evidence read", of=lambda one: ", ".join(one.each.evidence.read) or None),
-    Column("said", "The agent's own words", of=lambda one: _quote(one.each.evidence)),
-    Column("status", "Status", of="each.submit.status"),
-    Column("edit", "Edit", of="each.transition.edit"),
-    Column("changed_lines", "Changed lines", "integer", of="each.submit.changed_lines"),
-    Column("visible", "Visible mean", "number", of="each.submit.mean_return"),
-    Column("validation", "Validation mean", "number", of="each.submit.val_mean"),
-    Column("best", "New validation best", of=lambda one: (t := one.each.transition) and _YES_NO[t.hit]),
-    Column("selected", "Selected", of=lambda one: "yes" if one.each.submit is one.run.selected else None),
+    Column("submit", "Submit", of="submit.label"),
+    Column("before", "Budget before", "integer", of="submit.consumed_before"),
+    Column("after", "Budget after", "integer", of="submit.consumed"),
+    Column("read", "Evidence read", of=lambda one: ", ".join(one.evidence.read) or None),
+    Column("said", "The agent's own words", of=lambda one: _quote(one.evidence)),
+    Column("status", "Status", of="submit.status"),
+    Column("edit", "Edit", of="transition.edit"),
+    Column("changed_lines", "Changed lines", "integer", of="submit.changed_lines"),
+    Column("visible", "Visible mean", "number", of="submit.mean_return"),
+    Column("validation", "Validation mean", "number", of="submit.val_mean"),
+    Column("best", "New validation best", of=lambda one: (t := one.transition) and _YES_NO[t.hit]),
+    Column("selected", "Selected", of=lambda one: "yes" if one.submit is one.run.selected else None),
 )
 
 
 def submits_of(trace: Trace) -> list[dict[str, Any]]:
     """A run's rows of the table of feedback use."""
-    return rows_of([_Of(trace.run, row) for row in trace.rows], _FEEDBACK)
+    run, transitions, evidence = trace.run, trace.transitions, trace.evidence
+    submits = [
+        _Of(run, one, transitions.get(one.index), evidence.get(one.index, Evidence())) for one in run.submits
+    ]
+    return rows_of(submits, _FEEDBACK)
 
 
 def _quote(evidence: Evidence) -> str:

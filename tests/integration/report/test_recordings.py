@@ -179,24 +179,21 @@ def test_a_harnesss_log_tells_what_was_read_and_said_before_each_submit(runs: Pa
     loaded = load_runs([run_dir(runs, entry, "toy/line")])
     (run,) = loaded.runs
     found = trace(run)
-    assert [row.submit.index for row in found.rows] == [0, 1, 2]
-    first, second, third = (row.evidence for row in found.rows)
+    first, second, third = (found.evidence[index] for index in range(3))
     assert (first.read, first.messages) == ((), ())
-    for evidence, row, plan in (
-        (second, found.rows[0], "add a term"),
-        (third, found.rows[1], "change a constant"),
+    before = run.submits
+    assert [one.index for one in before] == [0, 1, 2]
+    for evidence, submit, plan in (
+        (second, before[0], "add a term"),
+        (third, before[1], "change a constant"),
     ):
-        name = f"submit_{row.submit.index:03d}"
+        name = f"submit_{submit.index:03d}"
         assert evidence.read == (f"feedback/{name}/summary.json",)
-        quote = f"{name} came to a mean return of {row.submit.mean_return:.4g}. I {plan} next."
+        quote = f"{name} came to a mean return of {submit.mean_return:.4g}. I {plan} next."
         assert evidence.attribution == quote
         assert evidence.messages == ("submitted", quote)
     assert found.unplaced == ("submitted",)
-    assert [row.transition.edit for row in found.rows if row.transition] == [
-        "first",
-        "synthesis",
-        "parametric",
-    ]
+    assert [each.edit for each in found.transitions.values()] == ["first", "synthesis", "parametric"]
 
 
 def test_trace_page_quotes_the_agent_beside_the_files_that_it_read(runs: Path, tmp_path: Path) -> None:

@@ -129,12 +129,12 @@ VERSIONS = [
 def test_log_gives_each_submit_what_was_read_and_said_before_it(tmp_path: Path, form: str) -> None:
     run = read_run(write_run(tmp_path, VERSIONS, log=form))
     found = trace(run)
-    evidence = [row.evidence for row in found.rows]
+    evidence = found.evidence
     said = ["I start simple.", "It is too slow.", "", "Back to work."]
-    assert [one.attribution for one in evidence] == said
+    assert [one.attribution for one in evidence.values()] == said
     assert evidence[0].read == ()
     assert evidence[1].read[0] == "feedback/submit_000/summary.json"
-    assert [path.name for path in found.rows[1].images] == ["probe.png"]
+    assert [path.name for path in found.images[1]] == ["probe.png"]
     assert found.unplaced == ()
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -20,10 +20,10 @@ from evopolicy_common.terminal import counted, duration, number
 from evopolicy_coordinator.web.content.rendering import Words, ident, part, short, state_words
 from evopolicy_coordinator.web.content.run_detail import IMAGES, MAX_WORDS, CodeFile, Detail, Happened
 from evopolicy_coordinator.web.content.run_folders import Reader, RunFacts, Runs
-from evopolicy_results.behaviour.trace import Trace, TraceRow, diff, trace
+from evopolicy_results.behaviour.trace import Trace, diff, trace
 from evopolicy_results.figures.line_chart import chart
 from evopolicy_results.html import View, notice
-from evopolicy_results.html.run_page import SubmitRow, run_view, submit_rows
+from evopolicy_results.html.run_page import run_view
 from evopolicy_results.reading.reader import read_run
 from evopolicy_results.reading.records import Submit
 from evopolicy_results.studies.palette import looks
@@ -41,18 +41,15 @@ def live_run_view(
 ) -> View:
     """One run: curve, submits, words, events. `retries`: the jobs of it that the cluster has played again."""
     may_show, path = runs.may_show(run), run.path
-    found = None
-    if path is not None and run.finished:
-        found = _finished_rows(path, run.stamp, run.key, may_show=may_show)
-    if path is None or found is not None:
-        rows, traced = found or ([], None)
-    else:
-        rows, traced = (
-            submit_rows([TraceRow(submit=one) for one in reader.submits(path)], href=_address(run.key)),
-            None,
-        )
+    traced = _traced(path, run.stamp) if path is not None and run.finished else None
+    submits: Sequence[Submit] = () if traced is None else traced.run.submits
+    if path is not None and traced is None:
+        submits = reader.submits(path)
     view = run_view(
-        rows,
+        submits,
+        traced,
+        may_show=may_show,
+        href=lambda submit: f"/run/{run.key}/submit/{submit.index}",
         entry=run.entry,
         env=run.env,
         look=looks(runs.entries, None).get(run.entry),
@@ -61,7 +58,6 @@ def live_run_view(
         budget=run.budget or 0,
         reference=("random, held-out", run.random) if may_show and run.random is not None else None,
         is_finished=run.finished,
-        trace=traced if may_show else None,
         lists=("messages", "events"),
     )
     detail = None if path is None else Detail(path)
@@ -83,27 +79,13 @@ def live_run_view(
 
 
 @lru_cache(maxsize=8)
-def _finished_rows(
-    folder: Path, stamp: tuple[int, int], key: str, *, may_show: bool
-) -> tuple[list[SubmitRow], Trace | None] | None:
-    """The rows of a finished run as a report has them; None for a run that a report leaves out. `stamp`: of its record,
-    `key`: in addresses."""
+def _traced(folder: Path, stamp: tuple[int, int]) -> Trace | None:
+    """The trace of a finished run as a report has it; None for a run that a report leaves out. `stamp`: of its
+    record."""
     try:
-        traced = trace(read_run(folder))
-        rows = submit_rows(
-            traced.rows,
-            folder=folder,
-            selected=traced.run.record.outcome.best_submit_index,
-            may_show=may_show,
-            href=_address(key),
-        )
+        return trace(read_run(folder))
     except Exception:  # an agent wrote the files; the rows then have what their summaries have
         return None
-    return rows, traced
-
-
-def _address(key: str) -> Callable[[Submit], str]:
-    return lambda submit: f"/run/{key}/submit/{submit.index}"
 
 
 def _retried(one: RetriedJobs) -> Happened:
