@@ -87,7 +87,7 @@ async def _listen(gateway: Gateway) -> None:
 def progress_of(machine: TicketMachine) -> Progress:
     """A run in the operator's live view."""
     settled = [ticket for ticket in machine.tickets if ticket.status is not None]
-    means = [ticket.summary.mean for ticket in settled if ticket.summary.mean is not None]
+    means = [ticket.mean_return for ticket in settled if ticket.mean_return is not None]
     running, last = machine.in_flight, settled[-1] if settled else None
     fields = () if running is None else ("submit_id", "n_episodes", "n_done", "waits_for")
     now: dict[str, Any] = {name: getattr(running, name) for name in fields}
@@ -98,7 +98,7 @@ def progress_of(machine: TicketMachine) -> Progress:
         n_rejected=machine.n_rejected,
         last_submit_id=last.submit_id if last else None,
         last_status=last.status if last else None,
-        last_mean=last.summary.mean if last else None,
+        last_mean=last.mean_return if last else None,
         best_mean=max(means, default=None),
         in_flight_s=round(machine.in_flight_s, 3),
         feedback_s=round(machine.feedback_s, 3),

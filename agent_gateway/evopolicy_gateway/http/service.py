@@ -124,8 +124,8 @@ def _of_ticket(ticket: Ticket, pipeline: SubmitPipeline) -> Response:
         "status": ticket.status,
         "is_finalized": pipeline.machine.finalizes(ticket),
         "feedback": f"feedback/{ticket.submit_id}",
-        "policy_failures": ticket.summary.policy_failures,
-        "warning": ticket.summary.warning,
+        "policy_failures": ticket.policy_failures,
+        "warning": ticket.warning,
     }
     body = orjson.dumps(head)[:-1] + b',"summary":' + summary + b"}"
     return Response(body, media_type="application/json")

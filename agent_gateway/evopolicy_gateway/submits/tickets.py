@@ -20,10 +20,9 @@ State that survives the process changes in `noted` alone, when its entry is dura
 
 from __future__ import annotations
 
-import math
 from collections import Counter
 from collections.abc import Mapping
-from typing import cast, get_args
+from typing import Any, cast, get_args
 
 import msgspec
 
@@ -57,20 +56,6 @@ class ConflictError(RequestError):
         """Index of the earlier submit."""
 
 
-class SummaryPart(msgspec.Struct, frozen=True):
-    """The part of a summary that a gateway keeps."""
-
-    mean_return: float | str | None = None
-    policy_failures: int | None = None
-    warning: str | None = None
-
-    @property
-    def mean(self) -> float | None:
-        """None without returns, or when the mean is not finite."""
-        mean = self.mean_return
-        return mean if isinstance(mean, float) and math.isfinite(mean) else None
-
-
 class Ticket(msgspec.Struct, kw_only=True, eq=False):
     """The state of a submit that passed the checks."""
 
@@ -91,8 +76,10 @@ class Ticket(msgspec.Struct, kw_only=True, eq=False):
     place: int | None = None
     """Offset of the journal's entry with its summary; None before its feedback is committed."""
     status: str | None = None
-    summary: SummaryPart = SummaryPart()
-    """Without values until it is settled."""
+    mean_return: float | None = None
+    """As in its summary, as the next two; None before it is settled, and for a mean that is not finite."""
+    policy_failures: int | None = None
+    warning: str | None = None
     error: RequestError | None = None
     """The reason for its failure or refusal."""
 
@@ -179,7 +166,7 @@ class TicketMachine:
     @property
     def last_warning(self) -> str | None:
         """The warning of the last answered submit about its policy; None when the policy did not fail."""
-        answered = (ticket.summary.warning for ticket in reversed(self.tickets) if ticket.status is not None)
+        answered = (ticket.warning for ticket in reversed(self.tickets) if ticket.status is not None)
         return next(answered, None)
 
     def finalizes(self, ticket: Ticket) -> bool:
@@ -324,7 +311,10 @@ class TicketMachine:
         return self.next()
 
     def _settle(self, ticket: Ticket, entry: open_run.Settled, place: int) -> None:
-        ticket.summary = msgspec.json.decode(entry.summary, type=SummaryPart)
+        summary = msgspec.json.decode(entry.summary, type=dict[str, Any])
+        mean = summary["mean_return"]
+        ticket.mean_return = mean if isinstance(mean, float) else None
+        ticket.policy_failures, ticket.warning = summary.get("policy_failures"), summary.get("warning")
         ticket.status, ticket.place, ticket.waits_for = entry.status, place, ""
         ticket.n_done = ticket.n_episodes
         # To save memory: a run has thousands of episodes.
