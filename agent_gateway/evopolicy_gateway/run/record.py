@@ -32,7 +32,7 @@ from evopolicy_common.records import run_record as schema
 from evopolicy_common.records.account import Claims
 from evopolicy_common.records.blobs import BlobStore, write_atomically
 from evopolicy_common.records.code_metrics import CodeMetrics
-from evopolicy_common.records.open_run import Accepted, Rejected, Requested
+from evopolicy_common.records.open_run import Rejected, Requested
 from evopolicy_common.records.policies import bundles, checkpoints
 from evopolicy_common.records.policies.bundles import Bundle
 from evopolicy_common.records.policies.checkpoints import CheckpointMeta
@@ -276,10 +276,16 @@ def _from_journal(folder: RunFolder) -> tuple[list[schema.RejectedSubmit], dict[
         return [], {}
     with contextlib.closing(Journal(folder.journal)) as journal:
         entries = journal.entries.values()
-    kept = {entry.submit.key: entry.kept for entry in entries if isinstance(entry, Requested)}
-    accepted = [entry for entry in entries if isinstance(entry, Accepted)]
-    rejected = [entry.submit for entry in entries if isinstance(entry, Rejected)]
-    return rejected, {entry.submit_index: kept.get(entry.key) for entry in accepted}
+    rejected: list[schema.RejectedSubmit] = []
+    kept: dict[int, str | None] = {}
+    for entry in entries:
+        if isinstance(entry, Requested):
+            requested = entry
+        elif isinstance(entry, gateway.SubmitAccepted):
+            kept[entry.submit_index] = requested.kept
+        elif isinstance(entry, Rejected):
+            rejected.append(entry.submit)
+    return rejected, kept
 
 
 def _meta(submit: SubmitResult) -> CheckpointMeta:

@@ -26,11 +26,10 @@ import msgspec
 from evopolicy_common.errors import ProtocolError, RefusedError
 from evopolicy_common.logs import structlog
 from evopolicy_common.messages.episode import BlobRef
-from evopolicy_common.messages.gateway import EpisodeFeedback, ResultsPage, SubmitDone
+from evopolicy_common.messages.gateway import EpisodeFeedback, ResultsPage, SubmitAccepted, SubmitDone
 from evopolicy_common.processes.left_files import left_files
 from evopolicy_common.processes.scratch import give_back_rights, remove_tree
 from evopolicy_common.records.blobs import fsync_directory, sync_filesystem
-from evopolicy_common.records.open_run import Accepted
 from evopolicy_common.refusals import Refusal
 from evopolicy_common.regular_files import open_regular
 from evopolicy_gateway.run_folder.journal import AtWork, write_all
@@ -149,7 +148,7 @@ class Collector:
 
     machine: TicketMachine
     ticket: Ticket
-    accepted: Accepted
+    accepted: SubmitAccepted
     client: CoordinatorClient
     tree: SubmitTree
     at_work: AtWork
@@ -194,7 +193,7 @@ class Collector:
         others: list[EpisodeFeedback] = []
         for each in wanted:
             inline = all(ref is None or ref.inline is not None for ref in (each.trajectory, each.video))
-            died = self.machine.deaths[self.accepted.key, each.index]
+            died = self.machine.deaths[self.ticket.request.submit.key, each.index]
             (suspects if died else whole if inline else others).append(each)
 
         async def write(episodes: list[EpisodeFeedback]) -> None:
@@ -213,7 +212,7 @@ class Collector:
             await write([episode])
 
     async def _fetch(self, episode: EpisodeFeedback) -> _Fetched:
-        if self.machine.deaths[self.accepted.key, episode.index] >= MAX_DEATHS:
+        if self.machine.deaths[self.ticket.request.submit.key, episode.index] >= MAX_DEATHS:
             return f"the gateway ended {MAX_DEATHS} times while it wrote this episode's trajectory"
         if self.machine.run.feedback == "scores":
             return b"", None
@@ -243,7 +242,7 @@ class Collector:
         run, at = self.machine.run, time.time()
         if not isinstance(content, str):
             try:
-                with self.at_work.on(self.accepted.key, episode.index):
+                with self.at_work.on(self.ticket.request.submit.key, episode.index):
                     return episode_files(
                         episode,
                         *content,
@@ -260,7 +259,7 @@ class Collector:
         return set_aside_files(episode, content, at=at, texts=shows_texts(run.feedback, run.env.obs_storage))
 
     def _log_error(self, event: str, episode: EpisodeFeedback, **facts: object) -> None:
-        log.error(event, submit=self.accepted.key, index=episode.index, **facts)
+        log.error(event, submit=self.ticket.request.submit.key, index=episode.index, **facts)
 
     def _commit(self, done: SubmitDone) -> bytes:
         errors, run = None, self.machine.run

@@ -21,7 +21,7 @@ from evopolicy_common.errors import RefusedError, RequestError, StorageError
 from evopolicy_common.logs import structlog
 from evopolicy_common.messages.gateway import RunOpened, Submit, SubmitAccepted, SubmitDone
 from evopolicy_common.records.blobs import BlobStore
-from evopolicy_common.records.open_run import Accepted, AnyLine, Died, Requested, Settled
+from evopolicy_common.records.open_run import AnyLine, Died, Requested, Settled
 from evopolicy_common.records.policies.trees import Recorder
 from evopolicy_common.refusals import RUN_LOST, Refusal
 from evopolicy_gateway.run_folder.journal import Journal
@@ -188,7 +188,7 @@ class SubmitPipeline:
                     return machine.collected(*await self._collect(ticket))
                 case Note(entry):
                     following = machine.noted(entry, await self._note(entry))
-                    if isinstance(entry, Accepted):
+                    if isinstance(entry, SubmitAccepted):
                         log.info("submit accepted", submit=ticket.submit_id, n_episodes=ticket.n_episodes)
                     elif isinstance(entry, Settled):
                         log.info("submit committed", submit=ticket.submit_id, status=entry.status)

@@ -9,7 +9,7 @@ The pipeline performs one effect at a time and passes its outcome to the method 
 | the ticket in flight | effect         | outcome                                                                     |
 |----------------------|----------------|-----------------------------------------------------------------------------|
 | is new               | `TakeSnapshot` | `snapshotted`: `Note` of the entry `Requested`                              |
-| is journalled        | `Send`         | `sent`: `Note` of `Accepted`; `refused`: `Note` of `Refused`, its end       |
+| is journalled        | `Send`         | `sent`: `Note` of `SubmitAccepted`; `refused`: `Note` of `Refused`, its end |
 | is accepted          | `Collect`      | `collected`: `Note` of `Settled`, its end                                   |
 | has an entry         | `Note`         | `noted`: the effect that its next state needs                               |
 | met an error         | `Note`, `Died` | `noted`: `Stop`, which ends the process. If that happens to the next gateway |
@@ -28,7 +28,7 @@ import msgspec
 
 from evopolicy_common.errors import RefusedError, RequestError
 from evopolicy_common.messages import gateway as messages
-from evopolicy_common.messages.gateway import CANCELLED, RunOpened, RunState
+from evopolicy_common.messages.gateway import CANCELLED, RunOpened, RunState, SubmitAccepted
 from evopolicy_common.records import open_run
 from evopolicy_common.records.blobs import digest_of
 from evopolicy_common.records.open_run import AnyLine, Requested
@@ -72,7 +72,7 @@ class Ticket(msgspec.Struct, kw_only=True, eq=False):
     waits_for: str = ""
     held_s: float = 0.0
     """Seconds in which none of its episodes ran because hidden episodes used the machines."""
-    accepted: open_run.Accepted | None = None
+    accepted: SubmitAccepted | None = None
     place: int | None = None
     """Offset of the journal's entry with its summary; None before its feedback is committed."""
     status: str | None = None
@@ -249,8 +249,8 @@ class TicketMachine:
         submit = msgspec.structs.replace(request.submit, bundle=snapshot.digest, **more)
         return Note(msgspec.structs.replace(request, submit=submit, kept=snapshot.kept))
 
-    def sent(self, reply: messages.SubmitAccepted) -> Note:
-        return Note(open_run.Accepted(key=self._open.request.submit.key, **msgspec.structs.asdict(reply)))
+    def sent(self, reply: SubmitAccepted) -> Note:
+        return Note(reply)
 
     def paged(self, page: messages.ResultsPage, n_done: int, held_before: float) -> None:
         """A page is written, `n_done` episodes in all. `held_before`: `held_s` before the first page."""
@@ -291,7 +291,7 @@ class TicketMachine:
             case Requested():
                 ticket = self.in_flight or self._begin(entry)
                 ticket.request, ticket.requested_at = entry, place
-            case open_run.Accepted():
+            case SubmitAccepted():
                 ticket = self._open
                 ticket.accepted, ticket.index = entry, entry.submit_index
                 ticket.submit_id = submit_id(ticket.index, self.run.episode_budget)

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import msgspec
 
-from evopolicy_common.messages.gateway import Submit
+from evopolicy_common.messages.gateway import Submit, SubmitAccepted
 from evopolicy_common.records.run_record import RejectedSubmit
 
 STATE = ".gateway"
@@ -43,8 +43,9 @@ def is_held(lock: Path) -> bool:
     return False
 
 
-class JournalLine(msgspec.Struct, frozen=True, kw_only=True, tag_field="what"):
-    """A line of the journal."""
+class JournalLine(msgspec.Struct, frozen=True, kw_only=True, tag_field="op"):
+    """A line of the journal, named as a message is. At most one submit is open: the line `SubmitAccepted` is of the one
+    that was requested last."""
 
 
 class Requested(JournalLine, frozen=True, kw_only=True, tag="requested"):
@@ -58,15 +59,6 @@ class Requested(JournalLine, frozen=True, kw_only=True, tag="requested"):
     """SHA-256 of the request's body, hex."""
     kept: str | None = None
     """As in `Snapshot`."""
-
-
-class Accepted(JournalLine, frozen=True, kw_only=True, tag="accepted"):
-    """The coordinator has accepted it: durable and charged."""
-
-    key: str
-    submit_index: int
-    first_global_episode: int
-    remaining_budget: int
 
 
 class Settled(JournalLine, frozen=True, kw_only=True, tag="settled"):
@@ -101,5 +93,5 @@ class Died(JournalLine, frozen=True, kw_only=True, tag="died"):
     """Request indices of these episodes; empty: the submit as a whole."""
 
 
-AnyLine = Requested | Accepted | Settled | Refused | Rejected | Died
+AnyLine = Requested | SubmitAccepted | Settled | Refused | Rejected | Died
 line_decoder = msgspec.json.Decoder(AnyLine)

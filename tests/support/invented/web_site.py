@@ -9,10 +9,10 @@ from typing import Any
 import msgspec
 from starlette.testclient import TestClient
 
-from evopolicy_common.messages.gateway import Submit
+from evopolicy_common.messages.gateway import Submit, SubmitAccepted
 from evopolicy_common.messages.run_settings import RunSettings
 from evopolicy_common.messages.status import RunStatus, StatusReply, WorkerStatus
-from evopolicy_common.records.open_run import Accepted, Requested
+from evopolicy_common.records.open_run import Requested
 from evopolicy_common.records.policies.bundles import BundleFile, pack
 from evopolicy_common.wire.credentials import Credentials
 from evopolicy_coordinator.web.access import Access
@@ -97,7 +97,7 @@ def open_run(
     (state / "bundles" / bundle.digest[:2] / bundle.digest).write_bytes(bundle.packed)
     (state / "intended.json").write_bytes(msgspec.json.encode({"key": "k", "settings": wanted, "run": run}))
     submit = Submit(key="one", env_instances=(0,), bundle=bundle.digest)
-    accepted = Accepted(key="one", submit_index=0, first_global_episode=0, remaining_budget=127)
+    accepted = SubmitAccepted(submit_index=0, first_global_episode=0, remaining_budget=127)
     lines = [Requested(submit=submit, client_key=None, body_digest="d"), accepted]
     (state / "journal.jsonl").write_bytes(b"".join(msgspec.json.encode(line) + b"\n" for line in lines))
     (folder / "logs").mkdir()

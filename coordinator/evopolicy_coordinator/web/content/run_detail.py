@@ -21,12 +21,13 @@ import numpy as np
 from evopolicy_common.confined import Confined, NotThereError
 from evopolicy_common.errors import DECODE_ERRORS, BundleError
 from evopolicy_common.messages.bounds import LARGEST
+from evopolicy_common.messages.gateway import SubmitAccepted
 from evopolicy_common.records import open_run
 from evopolicy_common.records.agent_log import Part, parts
 from evopolicy_common.records.blobs import is_digest
 from evopolicy_common.records.episodes.npz import read_arrays
 from evopolicy_common.records.json_text import objects
-from evopolicy_common.records.open_run import Accepted, Requested
+from evopolicy_common.records.open_run import Requested
 from evopolicy_common.records.policies import bundles
 from evopolicy_common.records.policies.checkpoints import METADATA
 from evopolicy_common.records.words import in_words
@@ -110,16 +111,15 @@ class Detail:
 
     def _bundle_of(self, index: int) -> str | None:
         """The digest of a submit's snapshot, by the gateway's journal."""
-        bundles_by_key: dict[str, str | None] = {}
+        digest: str | None = None
         for line in self.files.read_file(open_run.JOURNAL, _MAX_JOURNAL).splitlines():
             try:
                 entry = open_run.line_decoder.decode(line)
             except DECODE_ERRORS:
                 continue
             if isinstance(entry, Requested):
-                bundles_by_key[entry.submit.key] = entry.submit.bundle or entry.kept
-            elif isinstance(entry, Accepted) and entry.submit_index == index:
-                digest = bundles_by_key.get(entry.key)
+                digest = entry.submit.bundle or entry.kept
+            elif isinstance(entry, SubmitAccepted) and entry.submit_index == index:
                 return digest if digest is not None and is_digest(digest) else None
         return None
 

@@ -11,9 +11,8 @@ from hypothesis import strategies as st
 from rigs.finished_run import mark_opened
 
 from evopolicy_common.errors import ConfigError, StorageError
-from evopolicy_common.messages.gateway import Submit
+from evopolicy_common.messages.gateway import Submit, SubmitAccepted
 from evopolicy_common.records.open_run import (
-    Accepted,
     AnyLine,
     Rejected,
     Requested,
@@ -28,7 +27,7 @@ REQUESTED = Requested(
 )
 ENTRIES: list[AnyLine] = [
     REQUESTED,
-    Accepted(key="k", submit_index=0, first_global_episode=0, remaining_budget=3),
+    SubmitAccepted(submit_index=0, first_global_episode=0, remaining_budget=3),
     Settled(key="k", status="ok", summary='{\n  "a": "é\u2028"\n}\n'),
     Rejected(submit=RejectedSubmit(status="budget_invalid", message="no", at="1.5", after_submits=1)),
 ]

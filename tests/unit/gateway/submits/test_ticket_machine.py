@@ -17,7 +17,6 @@ from evopolicy_common.errors import RefusedError, RequestError
 from evopolicy_common.messages.gateway import RunState, SubmitAccepted, SubmitDone
 from evopolicy_common.records.blobs import digest_of
 from evopolicy_common.records.open_run import (
-    Accepted,
     AnyLine,
     Died,
     Refused,
@@ -169,9 +168,11 @@ class World:
         assert all(ticket.accepted for ticket in machine.tickets if ticket is not open_ticket)
         assert (self.effect is None) == (open_ticket is None)
         assert all((kind is ConflictError) == (before is not None) for kind, before in self.refusals)
-        for kinds in (Requested, Accepted, Settled | Refused):
+        for kinds in (Requested, Settled | Refused):
             keys = [getattr(one, "submit", one).key for one in self.journal if isinstance(one, kinds)]
             assert len(keys) == len(set(keys))
+        indices = [one.submit_index for one in self.journal if isinstance(one, SubmitAccepted)]
+        assert indices == list(range(len(indices)))
         charged = sum(ticket.n_episodes for ticket in machine.tickets if ticket.accepted)
         # An acceptance may be known from the coordinator's state before its reply arrives.
         assert self.state.remaining_budget <= machine.state.remaining_budget <= BUDGET - charged
