@@ -39,17 +39,6 @@ Replay = Callable[[Archive, Checked], None]
 """Replays recorded actions and adds the findings."""
 
 
-class LabRun(msgspec.Struct, frozen=True, kw_only=True):
-    run: Run
-    published: str
-    """The coordinator's id."""
-    episodes: tuple[tuple[Episode, tuple[float, ...]], ...]
-    """Held-out episodes of the selected checkpoint, each with the sum of its rewards so far at `_POINTS`
-    steps at most; without sums where the recording was withheld."""
-    unrecorded: bool = False
-    """Some of its episodes have no recording, so that no replay can contradict their returns."""
-
-
 class LabBundle(msgspec.Struct, kw_only=True):
     """One file of published results."""
 
@@ -61,13 +50,20 @@ class LabBundle(msgspec.Struct, kw_only=True):
     lab: str = ""
     """Name that the site's owner gives the signer; empty for none."""
     checked: Checked = msgspec.field(default_factory=Checked)
-    runs: list[LabRun] = []
+    runs: list[Run] = []
+    episodes: dict[str, tuple[tuple[Episode, tuple[float, ...]], ...]] = {}
+    """By the coordinator's id of a run: held-out episodes of the selected checkpoint, each with the sum of its rewards
+    so far at `_POINTS` steps at most; without sums where the recording was withheld."""
     left_out: list[LeftOut] = []
     """Runs of the file that a report leaves out, with the reason."""
     refused: str = ""
     """Why no run of it is shown; empty when they are."""
     heads: list[str] = []
     """Of its journal, after each entry."""
+
+    def runs_of(self, unrecorded: bool) -> list[Run]:
+        """Its runs that have episodes without a recording, or the others."""
+        return [run for run in self.runs if bool(self.checked.unrecorded(run.record.run)) == unrecorded]
 
     @property
     def processors(self) -> list[str]:
@@ -141,16 +137,8 @@ def _read_runs(archive: Archive, bundle: LabBundle, folder: Path) -> None:
         else each
         for each in loaded.left_out
     ]
-    bundle.runs = [
-        LabRun(
-            run=each,
-            published=run.opening.run,
-            episodes=_curves(archive, run),
-            unrecorded=bool(bundle.checked.unrecorded(run.opening.run)),
-        )
-        for each in loaded.runs
-        for run in (by_folder[each.path],)
-    ]
+    bundle.runs = list(loaded.runs)
+    bundle.episodes = {each.record.run: _curves(archive, by_folder[each.path]) for each in loaded.runs}
     if not bundle.runs:
         bundle.refused = "none of its runs has a score"
 
@@ -227,7 +215,7 @@ def _tell_apart(bundles: Sequence[LabBundle]) -> None:
     while shared := _shared(bundles):
         for bundle, name in zip(bundles, names, strict=True):
             for number, each in enumerate(bundle.runs):
-                agent = each.run.record.agent
+                agent = each.record.agent
                 if agent.entry in shared:
                     new = msgspec.structs.replace(agent, entry=f"{agent.entry} ({name})")
                     bundle.runs[number] = _with(each, agent=new)
@@ -237,21 +225,20 @@ def _tell_apart(bundles: Sequence[LabBundle]) -> None:
     seen: set[str] = set()
     for bundle in bundles:
         for number, each in enumerate(bundle.runs):
-            while each.run.name in seen:
-                each = _with(each, exp_id=f"{each.run.record.exp_id} ({each.published})")
+            while each.name in seen:
+                each = _with(each, exp_id=f"{each.record.exp_id} ({each.record.run})")
             bundle.runs[number] = each
-            seen.add(each.run.name)
+            seen.add(each.name)
 
 
-def _with(each: LabRun, **changes: object) -> LabRun:
+def _with(run: Run, **changes: object) -> Run:
     """The run with other fields of its `run.json`."""
-    record = msgspec.structs.replace(each.run.record, **changes)
-    return msgspec.structs.replace(each, run=msgspec.structs.replace(each.run, record=record))
+    return msgspec.structs.replace(run, record=msgspec.structs.replace(run.record, **changes))
 
 
 def _shared(bundles: Sequence[LabBundle]) -> set[str]:
     """Entries that several signers have."""
-    pairs = {(each.run.entry, bundle.signer) for bundle in bundles for each in bundle.runs}
+    pairs = {(each.entry, bundle.signer) for bundle in bundles for each in bundle.runs}
     return {entry for entry, n in Counter(entry for entry, _ in pairs).items() if n > 1}
 
 
@@ -276,11 +263,11 @@ class Board(msgspec.Struct, kw_only=True):
     mixed: bool = False
     """Whether its runs, of a single bundle, are no one comparison."""
     unrecorded: bool = False
-    """Its runs have episodes without a recording."""
+    """Its runs have episodes without a recording, so that no replay can contradict their returns."""
 
     @property
     def runs(self) -> list[Run]:
-        return [each.run for bundle in self.bundles for each in bundle.runs]
+        return [run for bundle in self.bundles for run in bundle.runs]
 
     @property
     def compared(self) -> list[Run]:
@@ -296,7 +283,7 @@ def boards(bundles: Sequence[LabBundle]) -> list[Board]:
         (unrecorded, msgspec.structs.replace(bundle, runs=runs))
         for bundle in bundles
         for unrecorded in (False, True)
-        if not bundle.refused and (runs := [one for one in bundle.runs if one.unrecorded == unrecorded])
+        if not bundle.refused and (runs := bundle.runs_of(unrecorded))
     ]
     for unrecorded, bundle in sorted(parts, key=lambda part: (-len(part[1].runs), part[1].file)):
         board = Board(bundles=[bundle], unrecorded=unrecorded)

@@ -20,9 +20,10 @@ import msgspec
 
 from evopolicy_results.html import notice, page, section
 from evopolicy_results.html.pages import table_view
-from evopolicy_results.leaderboard.bundles import Board, LabBundle, LabRun, boards
+from evopolicy_results.leaderboard.bundles import Board, LabBundle, boards
 from evopolicy_results.publish.findings import KINDS
 from evopolicy_results.reading.environments import title_of
+from evopolicy_results.reading.records import Run
 from evopolicy_results.report import check_folder, slug, write_file, write_report
 from evopolicy_results.studies.palette import looks
 from evopolicy_results.studies.study import Study, study_of
@@ -90,11 +91,10 @@ def _write_pages(bundles: Sequence[LabBundle], out: Path, title: str, tell: Tell
         reference = reference or study.reference
         sections.append(_board(board, study, number, folder))
         for bundle in board.bundles:
-            for each in bundle.runs:
-                run, name = each.run, slug(each.run)
+            for run in bundle.runs:
+                name, n = slug(run), len(bundle.episodes.get(run.record.run, ()))
                 own, episodes = f"{folder}/traces/{name}.html", f"episodes/{name}-{number}.html"
-                write_file(out / episodes, _episodes(each, bundle, f"../{own}"))
-                n = len(each.episodes)
+                write_file(out / episodes, _episodes(run, bundle, f"../{own}"))
                 runs.append(
                     (
                         *(run.entry, title_of(run.env), run.record.repeat),
@@ -250,13 +250,13 @@ def _bundle_page(bundle: LabBundle) -> str:
     )
 
 
-def _episodes(each: LabRun, bundle: LabBundle, run_page: str) -> str:
+def _episodes(run: Run, bundle: LabBundle, run_page: str) -> str:
     return page(
         "site_episodes",
-        title=f"{each.run.entry} on {title_of(each.run.env)}",
+        title=f"{run.entry} on {title_of(run.env)}",
         command=f"evopolicy check {shlex.quote(bundle.file)} --replay all",
         page=run_page,
-        episodes=[(episode, _points(sums)) for episode, sums in each.episodes],
+        episodes=[(episode, _points(sums)) for episode, sums in bundle.episodes.get(run.record.run, ())],
     )
 
 

@@ -16,7 +16,7 @@ from evopolicy_common.errors import ConfigError
 from evopolicy_common.records import journal
 from evopolicy_common.records.run_record import Artifacts, decode_run_record
 from evopolicy_results.leaderboard import write
-from evopolicy_results.leaderboard.bundles import LabBundle, LabRun, _compare_journals, _tell_apart, _unpack
+from evopolicy_results.leaderboard.bundles import LabBundle, _compare_journals, _tell_apart, _unpack
 from evopolicy_results.publish.findings import Checked, PublishedRun
 from evopolicy_results.reading.reader import read_run
 
@@ -27,18 +27,14 @@ A, B = "ab" * 32, "ab" * 4 + "cd" * 28
 
 def bundle(root: Path, signer: str, lab: str, *entries: str) -> LabBundle:
     runs = [
-        LabRun(
-            run=read_run(write_run(root / f"{signer}-{n}", VERSIONS, entry=entry)),
-            published=f"{root.name}-{n}",
-            episodes=(),
-        )
+        read_run(write_run(root / f"{signer}-{n}", VERSIONS, entry=entry, run=f"{root.name}-{n}"))
         for n, entry in enumerate(entries)
     ]
     return LabBundle(file="x.evp", sha256="", lab=lab, checked=Checked(signer=signer), runs=runs)
 
 
 def entries(of: LabBundle) -> list[str]:
-    return [each.run.entry for each in of.runs]
+    return [run.entry for run in of.runs]
 
 
 def test_entries_of_several_signers_get_their_names(tmp_path: Path) -> None:
@@ -85,7 +81,7 @@ def test_no_signer_gets_into_the_entry_of_another(tmp_path: Path) -> None:
 def test_runs_of_one_name_in_two_files_have_own_pages(tmp_path: Path) -> None:
     bundles = [bundle(tmp_path / name, A, "Lab-A", "evolve") for name in ("first", "second", "third")]
     _tell_apart(bundles)
-    names = [bundle.runs[0].run.name for bundle in bundles]
+    names = [bundle.runs[0].name for bundle in bundles]
     assert len(set(names)) == 3
     assert [name.rpartition(" (")[2] for name in names[1:]] == ["second-0)", "third-0)"]
 

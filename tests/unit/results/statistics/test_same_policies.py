@@ -13,7 +13,7 @@ from rigs.finished_run import finished
 from evopolicy_common.messages.operator import SubmitResult
 from evopolicy_common.records.policies import checkpoints
 from evopolicy_common.records.run_record import decode_run_record
-from evopolicy_results.leaderboard.bundles import LabBundle, LabRun
+from evopolicy_results.leaderboard.bundles import LabBundle
 from evopolicy_results.leaderboard.write import write_site
 from evopolicy_results.notebook import rows, study, tables_of
 from evopolicy_results.publish import card as cards
@@ -127,10 +127,7 @@ def test_a_report_names_equal_repeats_and_has_no_interval_over_runs(tmp_path: Pa
 
 
 def test_a_leaderboard_names_equal_repeats(tmp_path: Path) -> None:
-    runs = [
-        LabRun(run=read_run(folder), published=folder.name, episodes=())
-        for folder in played(tmp_path / "runs", (1.0, 1.0))
-    ]
+    runs = list(map(read_run, played(tmp_path / "runs", (1.0, 1.0))))
     lab = LabBundle(file="x.evp", sha256="", lab="Lab", checked=Checked(signer="ab" * 32), runs=runs)
     assert f"cases; {BOTH}" in write_site([lab], tmp_path / "site", title="Site").read_text()
 
