@@ -261,14 +261,17 @@ class GatewayClient:
         episodes: list[gateway.EpisodeFeedback] = []
         cursor = 0
         while True:
-            message = gateway.ResultsRequest(
-                run=self.run, token=self.token, submit_index=submit_index, cursor=cursor, wait_s=2.0
-            )
-            page = await self.ask.until_answered("results", message, gateway.ResultsPage, wait_s=2.0)
+            page = await self.page(submit_index, cursor, wait_s=2.0)
             episodes += page.episodes
             cursor = page.cursor
             if page.done is not None:
                 return episodes, page.done
+
+    async def page(self, submit_index: int, cursor: int = 0, wait_s: float = 0.0) -> gateway.ResultsPage:
+        message = gateway.ResultsRequest(
+            run=self.run, token=self.token, submit_index=submit_index, cursor=cursor, wait_s=wait_s
+        )
+        return await self.ask.until_answered("results", message, gateway.ResultsPage, wait_s=wait_s)
 
     async def close(self, reason: str = "agent_stopped") -> None:
         message = gateway.CloseRun(run=self.run, token=self.token, reason=reason)

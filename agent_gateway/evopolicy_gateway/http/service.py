@@ -312,10 +312,9 @@ def progress_document(ticket: Ticket, state: RunState | None = None) -> dict[str
     `held_s`: seconds of waiting because the cluster's other work used the machines; they count against no limit.
     """
     n_done, waits_for, held_s = ticket.n_done, ticket.waits_for, ticket.held_s
-    seen = state.in_flight if state is not None else None
-    if seen is not None and ticket.accepted is not None and seen.submit_index == ticket.accepted.submit_index:
-        n_done, waits_for = max(n_done, seen.n_done), waits_for or seen.waits_for
-        held_s = max(held_s, seen.held_s)
+    if state is not None and ticket.accepted is not None and state.n_submits == ticket.index + 1:
+        n_done, waits_for = max(n_done, state.n_done), waits_for or state.waits_for
+        held_s = max(held_s, state.open_held_s)
     return {
         "submit_id": ticket.index,
         "status": "running",

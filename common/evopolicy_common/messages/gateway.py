@@ -111,18 +111,6 @@ FREE_SLOT = "a free slot"
 """A value of `waits_for` that is normal for most submits and no cause for concern."""
 
 
-class SubmitInFlight(msgspec.Struct, frozen=True, kw_only=True):
-    """The submit in progress."""
-
-    submit_index: Int
-    n_episodes: Int
-    n_done: Int
-    waits_for: Text = ""
-    """The reason why none of its episodes runs, in words for the agent; empty while episodes run."""
-    held_s: Number = 0.0
-    """Seconds in which none of its episodes ran because hidden work had the machines; they count against no limit."""
-
-
 class RunState(msgspec.Struct, frozen=True, kw_only=True):
     """The changing part of a run, as its gateway may know it."""
 
@@ -131,11 +119,17 @@ class RunState(msgspec.Struct, frozen=True, kw_only=True):
     """Accepted submits so far."""
     is_finalized: bool
     """True when no more submits are accepted."""
-    in_flight: SubmitInFlight | None = None
     cancelled: bool = False
     """The operator ended the run."""
     held_s: Number = 0.0
-    """Sum of `SubmitInFlight.held_s` over the run's submits so far, seconds."""
+    """Seconds so far in which a submit was open and none of its episodes ran because hidden work had the machines; they
+    count against no limit."""
+    open_held_s: Number = 0.0
+    """Of these, the open submit's, which is the last one; 0.0 without one, as the following fields are empty."""
+    n_done: Int = 0
+    """Finished episodes of the open submit."""
+    waits_for: Text = ""
+    """The reason why none of its episodes runs, in words for the agent; empty while episodes run."""
 
 
 class RunOpened(Message, Conditions, frozen=True, kw_only=True, tag="run_opened"):

@@ -13,7 +13,7 @@ from pathlib import Path
 import msgspec
 
 from evopolicy_common.catalogue import installs
-from evopolicy_common.messages.gateway import FREE_SLOT, Permit, RunOpened, RunState, StateReply
+from evopolicy_common.messages.gateway import FREE_SLOT, Permit, RunOpened, StateReply
 from evopolicy_common.messages.operator import RunProgress
 from evopolicy_common.messages.worker import Message, Refused
 from evopolicy_coordinator.core.contract.effects import Refuse, Reply
@@ -108,14 +108,9 @@ def message(effect: Reply | Refuse, state: Path | None = None) -> Message:
         return reply
     text = reason_text(effect.waits_for)
     if isinstance(reply, RunOpened | StateReply):
-        return msgspec.structs.replace(reply, state=_with(reply.state, text))
+        return msgspec.structs.replace(reply, state=msgspec.structs.replace(reply.state, waits_for=text))
     if isinstance(reply, RunProgress):
         why = env_failure(effect.waits_for)
         return msgspec.structs.replace(reply, waits_for=operator_words(effect.waits_for), env_failure=why)
     assert isinstance(reply, Permit)
     return msgspec.structs.replace(reply, waits_for=text)
-
-
-def _with(state: RunState, text: str) -> RunState:
-    assert state.in_flight is not None
-    return msgspec.structs.replace(state, in_flight=msgspec.structs.replace(state.in_flight, waits_for=text))

@@ -154,21 +154,16 @@ def held_s(state: State, run: Run, now: float) -> float:
 
 def run_state(state: State, run: Run, now: float) -> tuple[gateway.RunState, Reason | None]:
     """The state that the gateway of an unfinished run is sent, and the reason that its open submit waits for."""
-    in_flight, waits_for = None, None
-    if run.open is not None:
-        group = state.groups[submit_group(run.id, run.open, "train")]
-        waits_for = waits.waits_for(state, group)
-        in_flight = gateway.SubmitInFlight(
-            submit_index=run.open, n_episodes=group.n, n_done=group.done, held_s=group.held_until_s(now)
-        )
+    group = None if run.open is None else state.groups[submit_group(run.id, run.open, "train")]
     current = gateway.RunState(
         remaining_budget=run.ledger.available,
         n_submits=len(run.submits),
         is_finalized=run.state.phase != "open",
-        in_flight=in_flight,
         held_s=held_s(state, run, now),
+        open_held_s=0.0 if group is None else group.held_until_s(now),
+        n_done=0 if group is None else group.done,
     )
-    return current, waits_for
+    return current, None if group is None else waits.waits_for(state, group)
 
 
 # ---- news ----

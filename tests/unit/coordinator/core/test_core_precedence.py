@@ -110,9 +110,9 @@ def test_submits_that_wait_for_hidden_cases_say_so(rig: Rig) -> None:
     assert split_of(hidden.job) == "validation"
     keep_alive(rig, session, 10.0, hidden)
     state = rig.ask(gateway.StateRequest, run="r1").state
-    assert state.in_flight.waits_for == "hidden cases of another run to be scored"
-    assert 7.0 <= state.in_flight.held_s <= 11.0
-    assert state.held_s == state.in_flight.held_s
+    assert state.waits_for == "hidden cases of another run to be scored"
+    assert 7.0 <= state.open_held_s <= 11.0
+    assert state.held_s == state.open_held_s
     page = rig.results(run="r1", cursor=1)
     assert page.held_s == state.held_s
     while (leases := rig.poll(session, 1)) or rig.core.state.workers["w1"].leases:
