@@ -1,10 +1,9 @@
 """Options declared once: a class of options has a field for each, with its type, default, bounds (`msgspec.Meta`) and
 `Option`.
 
-Made from it: options of commands (`cli/options.py`), tables of suite files (`suite/suite_file.py`), keywords of
-the package
-`evopolicy`, JSON Schemas, and `docs/reference/options.md`. The docstring below a field is its help; `group` is its
-heading.
+Made from it: options of commands (`cli/options.py`), tables of suite files (`suite/suite_file.py`), keywords of the
+package `evopolicy`, JSON Schemas, and `docs/reference/options.md`. The docstring below a field is its help; `group` of
+the class is the first fields' heading.
 """
 
 from __future__ import annotations
@@ -47,6 +46,8 @@ class Option(msgspec.Struct, frozen=True, kw_only=True):
     """Type of the key in suite files, None: no key. A path is a text there."""
     python: bool = True
     """Whether it is a keyword of `evopolicy.run`."""
+    group: str = ""
+    """The heading from this field on; empty: as before it."""
 
 
 class Declared(NamedTuple):
@@ -75,10 +76,11 @@ class Declared(NamedTuple):
 @functools.cache
 def declared(options: type[msgspec.Struct]) -> dict[str, Declared]:
     fields, plain, noted = {}, get_type_hints(options), get_type_hints(options, include_extras=True)
-    helps = field_texts(options)
+    helps, group = field_texts(options), vars(options)["group"]
     for field in msgspec.structs.fields(options):
         notes = _notes(noted[field.name])
-        (own,) = (each for each in options.__mro__ if field.name in inspect.get_annotations(each))
+        option = next((note for note in notes if isinstance(note, Option)), Option())
+        group = option.group or group
         fields[field.name] = Declared(
             field.name,
             plain[field.name],
@@ -86,8 +88,8 @@ def declared(options: type[msgspec.Struct]) -> dict[str, Declared]:
             next((note for note in notes if isinstance(note, Meta)), Meta()),
             field.default,
             helps[field.name],
-            vars(own)["group"],
-            next((note for note in notes if isinstance(note, Option)), Option()),
+            group,
+            option,
         )
     return fields
 

@@ -119,7 +119,9 @@ AGENT_LIMITS: dict[str, tuple[str, float, float]] = {
 greatest."""
 
 
-class RunPart(msgspec.Struct, frozen=True, kw_only=True):
+class RunOptions(msgspec.Struct, frozen=True, kw_only=True):
+    """The options of a run and of its agent."""
+
     group: ClassVar[str] = "Run"
 
     agent: Annotated[str, OF_ONE_RUN]
@@ -145,11 +147,7 @@ class RunPart(msgspec.Struct, frozen=True, kw_only=True):
     repeat: Annotated[int, Meta(ge=0), Option(suite=None, by_set=True)] = 0
     """Number of this repeat of the same agent and environment."""
 
-
-class ScorePart(RunPart, frozen=True, kw_only=True):
-    group: ClassVar[str] = "Score"
-
-    validation: Count | None = None
+    validation: Annotated[Count | None, Option(group="Score")] = None
     """Hidden validation cases."""
     heldout: Count | None = None
     """Hidden held-out cases."""
@@ -159,11 +157,7 @@ class ScorePart(RunPart, frozen=True, kw_only=True):
     replays: Annotated[VideoOption | None, RARE] = None
     """Videos of the held-out episodes; default: as --video."""
 
-
-class PolicyPart(ScorePart, frozen=True, kw_only=True):
-    group: ClassVar[str] = "Policy and feedback"
-
-    min_episodes: Annotated[Count | None, RARE] = None
+    min_episodes: Annotated[Count | None, Option(by_set=True, group="Policy and feedback")] = None
     """Least number of episodes in a submit."""
     max_episodes: Annotated[Count | None, RARE] = None
     """Greatest number of episodes in a submit."""
@@ -190,13 +184,7 @@ class PolicyPart(ScorePart, frozen=True, kw_only=True):
     feedback: Annotated[FeedbackDetail | None, RARE] = None
     """Feedback to the agent: scores, trajectories as well, or also pictures and videos (default)."""
 
-
-class RunOptions(PolicyPart, frozen=True, kw_only=True):
-    """The options of a run and, in this class, of its agent."""
-
-    group: ClassVar[str] = "Agent"
-
-    start_from: Annotated[str | None, Option(metavar="RUN@submit_NNN", suite=str)] = None
+    start_from: Annotated[str | None, Option(metavar="RUN@submit_NNN", suite=str, group="Agent")] = None
     """Start with the workspace of an earlier run's submit, and its feedback below history/. The run has a full
     budget."""
     agents_md: Annotated[Path | None, RARE] = None
