@@ -29,7 +29,7 @@ from evopolicy_common.records.run_record import RunRecord
 from evopolicy_common.records.summary import Summary
 from evopolicy_results.verify.source import RunUnderTest
 
-Told = Iterable[tuple[str, Any, Any]]
+Compared = Iterable[tuple[str, Any, Any]]
 """Names of numbers, each with its value and what it has to be."""
 
 MISSING = type("Missing", (), {"__repr__": lambda self: "nothing"})()
@@ -81,7 +81,7 @@ def differences(run: RunUnderTest, result: RunResult | None) -> Iterator[tuple[s
             yield file, str(error)
 
 
-def _stored_outcome(record: RunRecord, result: RunResult) -> Told:
+def _stored_outcome(record: RunRecord, result: RunResult) -> Compared:
     """The outcome in `run.json` against the one that the coordinator's result gives."""
     outcome = record.outcome
     try:
@@ -109,7 +109,7 @@ def unlike_documents(told: object, wanted: object, path: str = "") -> Iterator[t
         yield path, told, wanted
 
 
-def _outcome(run: RunUnderTest, spent: int) -> Told:
+def _outcome(run: RunUnderTest, spent: int) -> Compared:
     """`run.json` against itself and the submits."""
     outcome, dimensions = run.record.outcome, run.record.experiment_dimensions
     heldout, reference = outcome.heldout_returns, outcome.random_reference
@@ -138,7 +138,7 @@ def _outcome(run: RunUnderTest, spent: int) -> Told:
     yield "best_submit_index", outcome.best_submit_index, best_validated(eligible, dimensions.profile)
 
 
-def _summary(run: RunUnderTest, submit: SubmitFiles, spent: int) -> Told:
+def _summary(run: RunUnderTest, submit: SubmitFiles, spent: int) -> Compared:
     """A submit's summary against itself and the budget. `spent`: episodes up to its end."""
     summary = submit.summary
     if summary is None:
@@ -158,7 +158,7 @@ def _summary(run: RunUnderTest, submit: SubmitFiles, spent: int) -> Told:
         yield from _aggregates(summary)
 
 
-def _aggregates(summary: Summary) -> Told:
+def _aggregates(summary: Summary) -> Compared:
     n, returns, lengths = summary.n_episodes, summary.returns or (), summary.episode_lengths or ()
     yield "number of returns", len(returns), n
     yield "number of episode_lengths", len(lengths), n
@@ -184,7 +184,7 @@ def _aggregates(summary: Summary) -> Told:
         yield "number of successes", len(summary.successes), n
 
 
-def _meta(run: RunUnderTest, submit: SubmitFiles) -> Told:
+def _meta(run: RunUnderTest, submit: SubmitFiles) -> Compared:
     """A checkpoint's metadata against the summary and `run.json`."""
     meta, summary = submit.meta, submit.summary
     if meta is None:
@@ -202,7 +202,7 @@ def _meta(run: RunUnderTest, submit: SubmitFiles) -> Told:
         yield "remaining_budget_before", meta.remaining_budget_before, before
 
 
-def _rescore(run: RunUnderTest, name: str, record: RescoreRecord) -> Told:
+def _rescore(run: RunUnderTest, name: str, record: RescoreRecord) -> Compared:
     """A re-score against the run. Nothing in the directory determines its returns."""
     yield "name", record.name, name
     yield "run", record.run, run.record.run
@@ -220,7 +220,7 @@ def _rescore(run: RunUnderTest, name: str, record: RescoreRecord) -> Told:
         yield f"failures {what}", places, [place for place in places if place < record.n_cases]
 
 
-def _stored(submit: SubmitFiles, known: SubmitResult | None) -> Told:
+def _stored(submit: SubmitFiles, known: SubmitResult | None) -> Compared:
     """A submit against the coordinator's result."""
     summary = submit.summary
     if known is None or summary is None or summary.status == CANCELLED:
@@ -252,7 +252,7 @@ def _checkpoint(submit: SubmitFiles, known: SubmitResult | None) -> str | None:
 
 
 def _unlike(
-    file: str, told: Told, source: str = "what follows from the rest is"
+    file: str, told: Compared, source: str = "what follows from the rest is"
 ) -> Iterator[tuple[str, str]]:
     for name, here, wanted in told:
         if here != wanted:
