@@ -137,9 +137,17 @@ def _array_step(space: SpaceSchema, *, padded: bool) -> Step:
     return step
 
 
-def _text_step(text: Any, out: list[Any]) -> None:
-    data = text.encode("utf-8", "surrogatepass")
-    out.append(_COUNT.pack(len(data)) + data)
+def _text_step() -> Step:
+    last, data = "", _COUNT.pack(0)
+
+    def step(text: Any, out: list[Any]) -> None:
+        nonlocal last, data
+        if text is not last:  # Many environments give the same text, such as a mission, at each step.
+            encoded = text.encode("utf-8", "surrogatepass")
+            last, data = text, _COUNT.pack(len(encoded)) + encoded
+        out.append(data)
+
+    return step
 
 
 def _graph_step(value: Any, out: list[Any]) -> None:
@@ -153,7 +161,7 @@ def _step(space: SpaceSchema, *, padded: bool = False) -> Step:
     open, counts stand before the parts that they count."""
     kind = space["type"]
     if kind == "Text":
-        return _text_step
+        return _text_step()
     if kind == "Discrete":
         return lambda value, out: out.append(_INT.pack(value))
     if kind == "Graph":

@@ -32,6 +32,7 @@ from evopolicy_common.wire.codec import MAX_PACKED_BYTES
 MAX_TRACEBACK = 4000
 FILE = "begun"
 _LENGTH = struct.Struct("<I")
+_END = _LENGTH.pack(0)
 _BLOCK_BYTES = 64 << 10
 
 
@@ -52,12 +53,13 @@ class Begun:
         """Adds an action, before it reaches the environment."""
         self.taken.append((returned, action))
         if self.log is not None:
-            if type(action) is int:
+            kind = type(action)
+            if kind is int:
                 frame = _int_frame(action)
+            elif kind is np.ndarray:
+                frame = _array_head(action.dtype, action.shape) + action.tobytes() + _END
             else:
-                # Lists take a quarter of the time of arrays, and `repair` makes the same actions of them.
-                data = columns.encode(action.tolist() if type(action) is np.ndarray else action)
-                frame = _form(len(data)).pack(len(data), data, 0)
+                frame = _frame(columns.encode(action))
             self.log.append(frame)
 
     def fail(self, failure: PolicyFailure) -> None:
@@ -118,8 +120,7 @@ class Log:
     def write(self, begun: Begun) -> None:
         """Writes the episode anew."""
         self._at, self._full = 0, False
-        head = _encoder.encode((self._job, self._place, begun.packed()))
-        self.append(_form(len(head)).pack(len(head), head, 0))
+        self.append(_frame(_encoder.encode((self._job, self._place, begun.packed()))))
 
     def append(self, frame: bytes) -> None:
         """Adds an action, or the head; overwrites the end of the frame before."""
@@ -129,7 +130,7 @@ class Log:
             self._grow(end)
         if not self._full:
             self._map[at:end] = frame
-            self._at = end - _LENGTH.size
+            self._at = end - len(_END)
 
     def _grow(self, size: int) -> None:
         size = -(-max(size, 2 * self._size) // _BLOCK_BYTES) * _BLOCK_BYTES
@@ -141,16 +142,22 @@ class Log:
             self._full = True
 
 
-@functools.lru_cache(256)
-def _form(n: int) -> struct.Struct:
-    """A frame of `n` bytes, with the file's end after it."""
-    return struct.Struct(f"<I{n}sI")
+def _frame(data: bytes) -> bytes:
+    """A frame of `Log`, with the file's end after it."""
+    return _LENGTH.pack(len(data)) + data + _END
 
 
 @functools.lru_cache(256)
 def _int_frame(action: int) -> bytes:
-    data = columns.encode(action)
-    return _form(len(data)).pack(len(data), data, 0)
+    return _frame(columns.encode(action))
+
+
+@functools.lru_cache(256)
+def _array_head(dtype: np.dtype[Any], shape: tuple[int, ...]) -> bytes:
+    """An array's frame before its numbers: the bytes of one differ from those of another only there."""
+    zeros = np.zeros(shape, dtype)
+    frame = _frame(columns.encode(zeros))
+    return frame[: len(frame) - zeros.nbytes - len(_END)]
 
 
 def _frames(data: bytes) -> Iterator[bytes]:

@@ -212,6 +212,9 @@ def test_the_file_of_an_episode_holds_actions_of_any_form_and_length(
     assert begun.recovered(tmp_path, "other") == {}
     again = begun.recovered(tmp_path, "job")[2].unpacked()
     kept: list[Any] = [3, [0, 1, 2], {"a": [0.5, "x"]}, "\\ud800", 2**70, *values[4:]]
+    array = again.taken[1][1]
+    assert array.dtype == np.int8
+    again.taken[1] = array, array.tolist()
     assert [action for _, action in again.taken] == kept
     # With the failure after them; and on a full disk, as far as there is room.
     episode.fail(PolicyFailure(category="act_error", step_index=7, message="unlucky"))

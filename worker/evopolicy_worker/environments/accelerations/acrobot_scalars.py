@@ -57,7 +57,9 @@ class ScalarAcrobot(AcrobotEnv):
         turn = _bound(y4 + sixth * (l1 + 2 * l2 + 2 * l3 + l4), self.MAX_VEL_2)
         self.state = angle, bend, speed, turn
         angles = self._angles
-        angles[0], angles[1], angles[2] = angle, bend, bend + angle
+        angles[0] = angle
+        angles[1] = bend
+        angles[2] = bend + angle
         cosines = np.cos(angles).tolist()
         sines = np.sin(angles).tolist()
         terminated = -cosines[0] - cosines[2] > 1.0
@@ -76,7 +78,7 @@ def _wrap(angle: float) -> float:
 
 def _bound(speed: float, most: float) -> float:
     """The library's `bound` to ±`most`."""
-    return min(max(speed, -most), most)
+    return -most if speed < -most else most if speed > most else speed
 
 
 def _slope_of(env: AcrobotEnv, angles: Any) -> Slope:

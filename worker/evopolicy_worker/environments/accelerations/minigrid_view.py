@@ -2,11 +2,11 @@
 
 Replaces `MiniGridEnv.gen_obs`, which copies the 7 × 7 window into a new grid of walls and cells, rotates that up to
 four times cell by cell, spreads visibility through a mask array, and encodes what is left one cell after the other.
-Here the cells are read row by row, away from the agent, in its own axes; a row's visibility is seven bits, and what it
-passes on to the next depends only on these and on which of its cells are transparent, so it is looked up in a table
-that is filled by the library's rule; behind a row of which nothing is seen there is nothing to read. All of it is
-integers and object identity; cells still tell themselves what they are (`encode`, `see_behind`). With see-through walls
-or a view of another size the library's method is used.
+Here the cells are read row by row, away from the agent, in its own axes: a row is one slice of the grid's list. A row's
+visibility is seven bits, and what it passes on to the next depends only on these and on which of its cells are
+transparent, so it is looked up in a table that is filled by the library's rule; behind a row of which nothing is seen
+there is nothing to read. All of it is integers and object identity; cells but walls still tell themselves what they are
+(`encode`, `see_behind`). With see-through walls or a view of another size the library's method is used.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from functools import cache
 from typing import Any
 
 import numpy as np
+from minigrid.core.constants import COLOR_NAMES
 from minigrid.core.world_object import Wall
 from minigrid.minigrid_env import MiniGridEnv
 
@@ -22,12 +23,14 @@ from evopolicy_worker.environments.accelerations.specialise import specialise
 
 SIZE = 7
 _MIDDLE = SIZE // 2
-_CELL = 3
-"""Bytes: kind, color, state."""
+_HIDDEN = b"\x00\x00\x00"
+"""Of a cell: kind, color, state."""
 _FORWARD = ((1, 0), (0, 1), (-1, 0), (0, -1))
 """By direction of the agent: right, down, left, up."""
 _EMPTY = b"\x01\x00\x00"
-_OUTSIDE = Wall()
+_WALLS = {color: bytes(Wall(color).encode()) for color in COLOR_NAMES}
+_OUTSIDE = [Wall()]
+_COLUMNS = [[column for column in range(SIZE) if bits >> column & 1] for bits in range(1 << SIZE)]
 
 
 @cache
@@ -58,43 +61,49 @@ class DirectView(MiniGridEnv):  # type: ignore[misc]
             return super().gen_obs()
         grid = self.grid
         cells, width, height = grid.grid, grid.width, grid.height
+        x, y = int(self.agent_pos[0]), int(self.agent_pos[1])
         forward_x, forward_y = _FORWARD[self.agent_dir]
-        right_x, right_y = -forward_y, forward_x
-        left_x = int(self.agent_pos[0]) - _MIDDLE * right_x
-        left_y = int(self.agent_pos[1]) - _MIDDLE * right_y
-        image = bytearray(SIZE * SIZE * _CELL)
+        # The cells of a row that are inside the grid: from one column to another, so many cells of its list apart.
+        extent, across = (height, forward_x * width) if forward_x else (width, -forward_y)
+        beside = y if forward_x else x
+        at, first, last = y * width + x, _MIDDLE - beside, _MIDDLE - beside + extent
+        if across < 0:
+            first, last = SIZE - last, SIZE - first
+        first, last = max(first, 0), min(last, SIZE)
+        before, after = _OUTSIDE * first, _OUTSIDE * (SIZE - last)
+        at += (first - _MIDDLE) * across
+        n_inside = (width - x, height - y, x + 1, y + 1)[self.agent_dir]
+        parts = [_HIDDEN] * (SIZE * SIZE)
         seen = 1 << _MIDDLE
         for row in range(SIZE - 1, -1, -1):
-            x, y = left_x, left_y
-            line = []
+            if SIZE - row <= n_inside:
+                end = at + (last - first) * across
+                line = [*before, *cells[at : end if end >= 0 else None : across], *after]
+            else:
+                line = _OUTSIDE * SIZE
             clear, bit = 0, 1
-            for _ in range(SIZE):
-                if 0 <= x < width and 0 <= y < height:
-                    cell = cells[y * width + x]
-                    if cell is None or (type(cell) is not Wall and cell.see_behind()):
-                        clear |= bit
-                else:
-                    cell = _OUTSIDE
-                line.append(cell)
+            for cell in line:
+                if cell is None or (type(cell) is not Wall and cell.see_behind()):
+                    clear |= bit
                 bit += bit
-                x += right_x
-                y += right_y
             seen, behind = _row(seen, clear)
             if row == SIZE - 1:
                 line[_MIDDLE] = self.carrying or None
-            place = row * _CELL
-            for column in range(SIZE):
-                if seen >> column & 1:
-                    cell = line[column]
-                    image[place : place + _CELL] = _EMPTY if cell is None else bytes(cell.encode())
-                place += SIZE * _CELL
+            for column in _COLUMNS[seen]:
+                cell = line[column]
+                if cell is None:
+                    told = _EMPTY
+                elif type(cell) is Wall:
+                    told = _WALLS[cell.color]
+                else:
+                    told = bytes(cell.encode())
+                parts[column * SIZE + row] = told
             if not behind:
                 break
             seen = behind
-            left_x += forward_x
-            left_y += forward_y
+            at += forward_y * width + forward_x
         return {
-            "image": np.frombuffer(image, dtype=np.uint8).reshape(SIZE, SIZE, _CELL),
+            "image": np.frombuffer(bytearray().join(parts), dtype=np.uint8).reshape(SIZE, SIZE, 3),
             "direction": self.agent_dir,
             "mission": self.mission,
         }

@@ -32,10 +32,22 @@ class _Direct(MujocoEnv):
         self._ctrl, self._qpos, self._qvel = self.data.ctrl, self.data.qpos, self.data.qvel
         self._seconds = self.dt
 
+    def gather(self, *parts: Any) -> None:
+        """Keep room for an observation of these parts."""
+        self._room = np.concatenate(parts)
+        ends = np.cumsum([len(part) for part in parts])[:-1]
+        self._parts = tuple(zip(np.split(self._room, ends), parts, strict=True))
+
+    def gathered(self) -> Any:
+        """Their numbers now, as `np.concatenate` joins them."""
+        for room, part in self._parts:
+            room[...] = part
+        return self._room.copy()
+
     def do_simulation(self, ctrl: Any, n_frames: int) -> None:
         if ctrl.shape != self._ctrl.shape:
             raise ValueError(f"Action dimension mismatch. Expected {self._ctrl.shape}, found {ctrl.shape}")
-        self._ctrl[:] = ctrl
+        self._ctrl[...] = ctrl
         mj_step(self.model, self.data, n_frames)
 
     def position(self, body: str) -> Any:
@@ -46,7 +58,7 @@ class DirectCheetah(_Direct, HalfCheetahEnv):
     def look_up(self) -> None:
         super().look_up()
         skipped = 1 if self._exclude_current_positions_from_observation else 0
-        self._parts = self._qpos[skipped:], self._qvel
+        self.gather(self._qpos[skipped:], self._qvel)
 
     def step(self, action: Any) -> Any:
         qpos = self._qpos
@@ -60,15 +72,16 @@ class DirectCheetah(_Direct, HalfCheetahEnv):
         return self._get_obs(), forward - cost, False, False, info
 
     def _get_obs(self) -> Any:
-        return np.concatenate(self._parts)
+        return self.gathered()
 
 
 class DirectReacher(_Direct, ReacherEnv):
     def look_up(self) -> None:
         super().look_up()
         self._fingertip, self._target = self.position("fingertip"), self.position("target")
-        self._theta = self._qpos[:2]
-        self._rest = self._qpos[2:], self._qvel[:2]
+        self._theta, self._aim, self._speeds = self._qpos[:2], self._qpos[2:], self._qvel[:2]
+        self._room = np.empty(10)
+        self._pairs = np.split(self._room, 5)
 
     def step(self, action: Any) -> Any:
         self.do_simulation(action, self.frame_skip)
@@ -82,15 +95,18 @@ class DirectReacher(_Direct, ReacherEnv):
         return self._observation(self._fingertip - self._target)
 
     def _observation(self, apart: Any) -> Any:
-        theta = self._theta
-        return np.concatenate((np.cos(theta), np.sin(theta), *self._rest, apart[:2]))
+        cosines, sines, aim, speeds, gap = self._pairs
+        np.cos(self._theta, cosines)
+        np.sin(self._theta, sines)
+        aim[...], speeds[...], gap[...] = self._aim, self._speeds, apart[:2]
+        return self._room.copy()
 
 
 class DirectPusher(_Direct, PusherEnv):
     def look_up(self) -> None:
         super().look_up()
         self._tips, self._object, self._goal = map(self.position, ("tips_arm", "object", "goal"))
-        self._parts = self._qpos[:7], self._qvel[:7], self._tips, self._object, self._goal
+        self.gather(self._qpos[:7], self._qvel[:7], self._tips, self._object, self._goal)
 
     def step(self, action: Any) -> Any:
         self.do_simulation(action, self.frame_skip)
@@ -102,7 +118,7 @@ class DirectPusher(_Direct, PusherEnv):
         return self._get_obs(), dist + ctrl + near, False, False, info
 
     def _get_obs(self) -> Any:
-        return np.concatenate(self._parts)
+        return self.gathered()
 
 
 _CLASSES = {HalfCheetahEnv: DirectCheetah, ReacherEnv: DirectReacher, PusherEnv: DirectPusher}

@@ -193,7 +193,7 @@ class GymnasiumFamily:
 
     def info(self, info: Mapping[str, Any]) -> dict[str, Any]:
         """The plain part of a step's `info`."""
-        return plain_info(info) if info else {}
+        return plain_info(info)
 
     def draw(self, codec: ActionCodec, rng: np.random.Generator, obs: Any) -> Any:
         """A random action after an observation, for checks. Override where hardly one of the action space does
@@ -251,7 +251,7 @@ class GymnasiumEnvironment(Environment):
     def __init__(
         self, entry: Entry, family: GymnasiumFamily, *, render: bool = False, accelerations: bool = False
     ) -> None:
-        self._entry, self._family = entry, family
+        self._entry, self._family, self._info = entry, family, family.info
         self._render, self._accelerate = render, accelerations
         self.accelerations: tuple[str, ...] = ()
         """Names of those in use."""
@@ -342,25 +342,25 @@ class GymnasiumEnvironment(Environment):
         return plain
 
     def step(self, action: Any) -> Step:
-        call.step = self._steps
+        steps = call.step = self._steps
         call.what = "step"
         if type(action) is not int:
             action = copied(action)
         if self._decode is not None:
             action = self._decode(action)
         returned = self.bare.step(action)
-        self._steps += 1
+        self._steps = steps = steps + 1
         try:
             obs, reward, terminated, truncated, info = returned
             if self._encode is not None:
                 obs = self._encode(obs)
-            plain = self._family.info(info)
-            if not OURS.isdisjoint(plain):
+            plain = self._info(info) if info else {}
+            if plain and not OURS.isdisjoint(plain):
                 plain = {f"{THEIRS}{key}" if key in OURS else key: value for key, value in plain.items()}
-            plain["steps"] = self._steps
+            plain["steps"] = steps
             if self._rewards is not None:
                 reward = self._rewards.scalar(reward, plain)
-            truncated = bool(truncated) or self._steps >= self._limit
+            truncated = bool(truncated) or steps >= self._limit
             step = _step(Step, (self._observe(obs), float(reward), bool(terminated), truncated, plain))
         except _MISSHAPEN as error:
             fault = trial.misshapen(returned, error, vector=self._rewards is not None)
