@@ -408,7 +408,8 @@ class _Course:
             components = info.get("rewards", info)
             for name in sums:
                 part = components.get(name)
-                sums[name] += part if isinstance(part, (int, float)) else 0.0
+                if type(part) is float or isinstance(part, (int, float)):
+                    sums[name] += part
         if self._solves and (reported := info.get(self._solves)) is not None:
             now = solved(reported)
             self.success = self.success if now is None else now or (self._ever and bool(self.success))

@@ -30,6 +30,9 @@ Slope = Callable[[float, float, float, float, float], tuple[float, float]]
 class ScalarAcrobot(AcrobotEnv):
     """An environment that computes its step with plain numbers."""
 
+    fresh = True
+    """As of MuJoCo's (`mujoco_state`)."""
+
     state: Any
     _angles: Any
     _slope: Slope

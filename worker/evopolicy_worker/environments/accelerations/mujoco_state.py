@@ -27,6 +27,9 @@ from evopolicy_worker.environments.accelerations.specialise import specialise
 class _Direct(MujocoEnv):
     """The code that the three share."""
 
+    fresh = True
+    """Observations are new arrays of the space's dtype, which nobody has to copy."""
+
     def look_up(self) -> None:
         """Keep views of the arrays that every step reads."""
         self._ctrl, self._qpos, self._qvel = self.data.ctrl, self.data.qpos, self.data.qvel

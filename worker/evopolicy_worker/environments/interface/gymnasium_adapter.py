@@ -361,7 +361,8 @@ class GymnasiumEnvironment(Environment):
             if self._rewards is not None:
                 reward = self._rewards.scalar(reward, plain)
             truncated = bool(truncated) or steps >= self._limit
-            step = _step(Step, (self._observe(obs), float(reward), bool(terminated), truncated, plain))
+            seen = obs if self._fresh else self._observe(obs)
+            step = _step(Step, (seen, float(reward), bool(terminated), truncated, plain))
         except _MISSHAPEN as error:
             fault = trial.misshapen(returned, error, vector=self._rewards is not None)
             raise WorkerError(f"{call}, {fault}") from error
@@ -409,6 +410,7 @@ class GymnasiumEnvironment(Environment):
             self._multiply(env)
         elif self._accelerate and not entry.kwargs:
             self.accelerations = tuple(accelerate(str(entry.gymnasium_id), env))
+        self._fresh = bool(self.accelerations) and not entry.wrappers and getattr(type(env), "fresh", False)
         for wrapper in entry.wrappers:
             env = _wrapped(entry.id, env, wrapper)
         self.bare = env
