@@ -61,7 +61,11 @@ def export(
             default = os.environ.get("MLFLOW_TRACKING_URI") or f"sqlite:///{default}.db"
         try:
             if to in _TRACKERS:
-                _track(runs, to, out or default, follow)
+                from evopolicy._exports import tracking
+
+                tracker = getattr(tracking, _TRACKERS[to])(out or default)
+                for name in tracking.track(runs, tracker, follow=follow):
+                    say_lines([name])
             else:
                 _write(runs, to, Path(out or default))
         except ModuleNotFoundError as error:
@@ -94,13 +98,6 @@ def _write(runs: list[Path], to: Format, out: Path) -> None:
     check_writable(out, "--out")
     out.mkdir(parents=True, exist_ok=True)
     say_lines(map(str, writers[to](runs_read, out)))
-
-
-def _track(runs: list[Path], to: Format, out: str, follow: bool) -> None:
-    from evopolicy._exports import tracking
-
-    for name in tracking.track(runs, getattr(tracking, _TRACKERS[to])(out), follow=follow):
-        say_lines([name])
 
 
 _TRACKERS = {"tensorboard": "TensorBoard", "mlflow": "MLflow", "wandb": "WeightsAndBiases"}

@@ -63,26 +63,23 @@ def keep(
         remove_tree(folder)
         _write(declared, started, folder)
     for each in declared:
-        _check_copy(each, folder)
+        about, place = each.recorded, _place(folder, each.recorded)
+        paths = (path for path in place.rglob("*") if path.is_symlink() or not path.is_dir())
+        copies = {path.relative_to(place).as_posix(): path for path in paths}
+        if copies.keys() != each.files.keys() or any(
+            path.is_symlink() or not path.is_file() or path.read_bytes() != each.files[name].data
+            for name, path in copies.items()
+        ):
+            raise ConfigError(
+                f"the run's copy of {about.kind} {about.name} in {place} was changed: start the run anew with"
+                " --overwrite"
+            )
     skills_named = tuple(each.recorded.name for each in declared if each.recorded.kind == "skill")
     return Kept(folder=folder, skills=skills_named, servers=started)
 
 
 def _place(folder: Path, about: AgentInput) -> Path:
     return folder / ("skills" if about.kind == "skill" else "mcp") / about.name
-
-
-def _check_copy(content: Content, folder: Path) -> None:
-    about, place = content.recorded, _place(folder, content.recorded)
-    paths = (path for path in place.rglob("*") if path.is_symlink() or not path.is_dir())
-    copies = {path.relative_to(place).as_posix(): path for path in paths}
-    if copies.keys() != content.files.keys() or any(
-        path.is_symlink() or not path.is_file() or path.read_bytes() != content.files[name].data
-        for name, path in copies.items()
-    ):
-        raise ConfigError(
-            f"the run's copy of {about.kind} {about.name} in {place} was changed: start the run anew with --overwrite"
-        )
 
 
 def _write(declared: Sequence[Content], servers: dict[str, Server], folder: Path) -> None:

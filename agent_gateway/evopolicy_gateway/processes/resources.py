@@ -58,7 +58,12 @@ class Resources:
         self.fixed_cores = bool(asked.cpus and "cpus" not in by and jailed)
         """Whether the programs may not choose their cores."""
         if self.fixed_cores:
-            values["cpus"], by["cpus"] = _bind(math.ceil(asked.cpus or 0)), "affinity"
+            # This thread is bound to that many of its cores, others for each process.
+            cores = sorted(os.sched_getaffinity(0))
+            first = os.getpid() % len(cores)
+            chosen = (cores[first:] + cores[:first])[: math.ceil(asked.cpus or 0)]
+            os.sched_setaffinity(0, chosen)
+            values["cpus"], by["cpus"] = float(len(chosen)), "affinity"
         self.own_pids: int | None = None
         """Resource limit for the programs themselves."""
         release = tuple(map(int, re.findall(r"\d+", os.uname().release)[:2]))
@@ -129,15 +134,6 @@ class Resources:
         most = self._asked.disk_bytes
         taken = f"its files take {n_bytes:,} bytes; {most:,} are allowed (agent_disk)"
         return taken if n_bytes > most else ""
-
-
-def _bind(n_cores: int) -> float:
-    """Binds this thread to that many of its cores, others for each process; returns their number."""
-    cores = sorted(os.sched_getaffinity(0))
-    first = os.getpid() % len(cores)
-    chosen = (cores[first:] + cores[:first])[:n_cores]
-    os.sched_setaffinity(0, chosen)
-    return float(len(chosen))
 
 
 LEAST_BYTES = 4096

@@ -66,7 +66,15 @@ def end_descendants(
         # Stopped first: a process that forks faster than it is listed must not outrun the killing.
         _signal_all(survivors, signal.SIGSTOP)
         _signal_all(_alive(spare, kept), signal.SIGKILL)
-        _kill_children(kept)
+        # This process's children are killed repeatedly: it has to be faster than such a chain forks.
+        me = os.getpid()
+        with (
+            contextlib.suppress(OSError, ValueError),
+            open(f"/proc/{me}/task/{me}/children", "rb", 0) as file,
+        ):
+            for _ in range(_KILLS):
+                file.seek(0)
+                _signal_all([pid for pid in map(int, file.read().split()) if pid not in kept], signal.SIGKILL)
         _reap(kept)
         time.sleep(_PAUSE_S)
     _reap(kept)
@@ -90,15 +98,6 @@ def _alive(spare: Collection[int], kept: Collection[int]) -> list[int]:
     """
     family = proc.family(os.getpid(), spare=spare)[1:]
     return [each.pid for each in family if not (each.dead and each.pid in kept)]
-
-
-def _kill_children(kept: Collection[int]) -> None:
-    """Kills this process's children repeatedly: it has to be faster than such a chain forks."""
-    me = os.getpid()
-    with contextlib.suppress(OSError, ValueError), open(f"/proc/{me}/task/{me}/children", "rb", 0) as file:
-        for _ in range(_KILLS):
-            file.seek(0)
-            _signal_all([pid for pid in map(int, file.read().split()) if pid not in kept], signal.SIGKILL)
 
 
 def _signal_all(pids: list[int], number: signal.Signals) -> None:

@@ -161,7 +161,9 @@ class Relay:
 
     def _route(self, request: Request) -> Route:
         headers, path = request.headers, request.scope["path"]
-        if not self._is_agents(headers):
+        given = [headers.get("authorization", "").partition(" ")[2]]
+        given += [headers.get(name, "") for name in apis.KEY_HEADERS]
+        if not any(hmac.compare_digest(each.encode(), self.order.token.encode()) for each in given):
             raise _RefusedError(
                 apis.NO_TOKEN, "the relay does not know this key; use the one of your environment"
             )
@@ -244,11 +246,6 @@ class Relay:
         if facts.tier and limited is not None and facts.tier not in limited.tiers:
             why = f"the service tier {facts.tier!r} has no price, and the run's cost is limited"
             raise _RefusedError(apis.INVALID, f"{why}: add it to prices.tiers")
-
-    def _is_agents(self, headers: Mapping[str, str]) -> bool:
-        given = [headers.get("authorization", "").partition(" ")[2]]
-        given += [headers.get(name, "") for name in apis.KEY_HEADERS]
-        return any(hmac.compare_digest(each.encode(), self.order.token.encode()) for each in given)
 
     def refusal(self, why: _RefusedError) -> Response:
         headers = {**why.headers, "content-type": "application/json"}

@@ -58,7 +58,13 @@ def files_of(names: Iterable[str], *, metadata_too: bool = False) -> dict[str, s
             continue
         distributions.add(name)
         if name == "numpy":
-            paths |= _numpy()
+            # The usual case, without reading the metadata of a distribution.
+            spec = importlib.util.find_spec("numpy")
+            if spec is None or not spec.submodule_search_locations:
+                raise ConfigError("numpy is not installed; install evopolicy again")
+            folder = Path(next(iter(spec.submodule_search_locations)))
+            both = [folder, folder.with_name("numpy.libs")]
+            paths |= {path.name: str(path) for path in both if path.is_dir()}
             continue
         tops, needs = _one(name, requested, required=name in wanted, metadata_too=metadata_too)
         paths |= tops
@@ -117,16 +123,6 @@ def modules_of(names: Iterable[str]) -> list[str]:
         ]
         modules += [top.removesuffix(".py") for top in tops if top.endswith(".py")]
     return modules
-
-
-def _numpy() -> dict[str, str]:
-    # The usual case, without reading the metadata of a distribution.
-    spec = importlib.util.find_spec("numpy")
-    if spec is None or not spec.submodule_search_locations:
-        raise ConfigError("numpy is not installed; install evopolicy again")
-    folder = Path(next(iter(spec.submodule_search_locations)))
-    both = [folder, folder.with_name("numpy.libs")]
-    return {path.name: str(path) for path in both if path.is_dir()}
 
 
 def _check_name(name: str) -> None:

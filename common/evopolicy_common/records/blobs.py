@@ -191,7 +191,12 @@ class BlobStore:
                 part.unlink()
                 have = 0
             if offset == 0 and len(data) < size:
-                self._make_room(part)
+                # A sender that has too many unfinished uploads loses its oldest.
+                parts = self._parts.glob(f"{part.name.partition('-')[0]}-*")
+                begun = [each for each in parts if each != part]
+                begun.sort(key=lambda each: each.stat().st_mtime, reverse=True)
+                for old in begun[MAX_UNFINISHED - 1 :]:
+                    old.unlink(missing_ok=True)
             if offset == have and offset + len(data) <= size:
                 with part.open("ab") as file:
                     file.write(data)
@@ -260,13 +265,6 @@ class BlobStore:
         with contextlib.suppress(OSError):
             os.utime(self.path(digest))
         return True
-
-    def _make_room(self, part: Path) -> None:
-        """Drops a sender's oldest unfinished uploads when it has too many."""
-        begun = [each for each in self._parts.glob(f"{part.name.partition('-')[0]}-*") if each != part]
-        begun.sort(key=lambda each: each.stat().st_mtime, reverse=True)
-        for old in begun[MAX_UNFINISHED - 1 :]:
-            old.unlink(missing_ok=True)
 
     def _finish(self, part: Path, digest: str) -> FileState:
         """Stores the blob whose bytes are in `part`. Raises StorageError when they are others."""

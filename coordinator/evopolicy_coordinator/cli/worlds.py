@@ -23,7 +23,7 @@ from evopolicy_common.catalogue.worlds import CANDIDATES, N_WORLDS, ids, unchang
 from evopolicy_common.cli.conventions import State, end_on_sigterm, run_to_end
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.local.cluster import local_cluster, unless_failed
-from evopolicy_common.messages.environment import EnvironmentDescription, Split
+from evopolicy_common.messages.environment import Split
 from evopolicy_common.messages.operator import DescribeEnvironment, Evaluate
 from evopolicy_common.processes.scratch import scratch_folder
 from evopolicy_common.records import splits as split_files
@@ -128,7 +128,9 @@ class _Trials:
         canonical = await self._mean(world, policy, key)
         ceiling, variants = None, 0
         if worlds.loses(base, canonical):
-            described = await self._description(world)
+            await self._evaluations.versions(DescribeEnvironment(env=world))
+            offered, *_ = await self._evaluations.ask.environments()
+            described = next(each.description for each in offered if each.description.env == world)
             names = tuple(described.definition.get("parameters", ()))
             rules = Rules(key, described.obs_space, described.action_space, names)
             for variants in range(1, 2 + (worlds.VARIANTS if PARAMETERS in rules.kinds else 0)):
@@ -169,8 +171,3 @@ class _Trials:
         )
         returns = [float(each.episode_return) async for each in self._evaluations.outcomes(message)]
         return math.fsum(returns) / len(returns)
-
-    async def _description(self, world: str) -> EnvironmentDescription:
-        await self._evaluations.versions(DescribeEnvironment(env=world))
-        offered, *_ = await self._evaluations.ask.environments()
-        return next(each.description for each in offered if each.description.env == world)

@@ -191,7 +191,13 @@ def issue(
                     f"{old.identity} was issued already ({how}); --renew makes it a new folder and voids the old one"
                 )
         made = [_make(authority, one, name, hosts, now, days) for one in roles]
-        _make_folder(out, again)
+        try:
+            out.mkdir(parents=True, mode=0o700, exist_ok=True)
+            if any(out.iterdir()) and not (again and (out / "ca.pem").exists()):
+                raise ConfigError(f"{out} already contains files; name another folder with --out")
+            out.chmod(0o700)
+        except OSError as error:
+            raise ConfigError(f"cannot make folder {out}: {error.strerror}") from error
         for machine, pair in made:
             listed[machine.identity] = machine
             prefix = "" if machine.role == role else f"{machine.role}-"
@@ -263,16 +269,6 @@ def _write_folder(
         ),
         out / f"{machine.role}.json",
     )
-
-
-def _make_folder(out: Path, again: bool) -> None:
-    try:
-        out.mkdir(parents=True, mode=0o700, exist_ok=True)
-        if any(out.iterdir()) and not (again and (out / "ca.pem").exists()):
-            raise ConfigError(f"{out} already contains files; name another folder with --out")
-        out.chmod(0o700)
-    except OSError as error:
-        raise ConfigError(f"cannot make folder {out}: {error.strerror}") from error
 
 
 @contextlib.contextmanager

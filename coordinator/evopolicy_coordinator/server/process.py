@@ -263,7 +263,22 @@ def _listen(
 ) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Returns the endpoints for this machine (with the state folder's socket if possible) and for others."""
     for endpoint in options.listen:
-        _check_listen(endpoint, options.insecure_tcp, machines)
+        if endpoint.startswith("tls/"):
+            if machines.tls is None:
+                raise ConfigError(
+                    f"--listen {endpoint}: there are no certificates in {machines.folder}; make them first with"
+                    f" evopolicy-coordinator certs init --state {machines.folder.parent}"
+                )
+        elif endpoint.startswith("tcp/") and not credentials.stays_on_machine(endpoint):
+            if not options.insecure_tcp:
+                raise ConfigError(
+                    f"--listen {endpoint} would send tokens and results unencrypted; run `evopolicy-coordinator certs"
+                    f" init` once and listen on {endpoint.replace('tcp/', 'tls/', 1)} (or, on a network that you"
+                    " trust, add --insecure-tcp)"
+                )
+            log.warning(
+                "tokens and results travel unencrypted; use a trusted network only", endpoint=endpoint
+            )
     wanted = resolve_listen(list(options.listen))
     remote = tuple(endpoint for endpoint in wanted if endpoint.startswith("tls/"))
     listen = tuple(endpoint for endpoint in wanted if endpoint not in remote)
@@ -274,20 +289,3 @@ def _listen(
             raise
         log.warning("not listening on a unix socket", why=str(error))
         return listen, remote
-
-
-def _check_listen(endpoint: str, insecure_tcp: bool, machines: Machines) -> None:
-    if endpoint.startswith("tls/"):
-        if machines.tls is None:
-            raise ConfigError(
-                f"--listen {endpoint}: there are no certificates in {machines.folder}; make them first with"
-                f" evopolicy-coordinator certs init --state {machines.folder.parent}"
-            )
-    elif endpoint.startswith("tcp/") and not credentials.stays_on_machine(endpoint):
-        if not insecure_tcp:
-            raise ConfigError(
-                f"--listen {endpoint} would send tokens and results unencrypted; run `evopolicy-coordinator certs init`"
-                f" once and listen on {endpoint.replace('tcp/', 'tls/', 1)} (or, on a network that you trust, add"
-                " --insecure-tcp)"
-            )
-        log.warning("tokens and results travel unencrypted; use a trusted network only", endpoint=endpoint)

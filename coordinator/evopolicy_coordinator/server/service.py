@@ -198,7 +198,12 @@ class Service:
         self.host.handle(event)
 
     def _serve_status(self, core: Core, query: IncomingQuery, parsed: Parsed) -> None:
-        query.reply(self._status_bytes(core, parsed.message.max_age_s), lane_of(parsed.asker))
+        # The status as a message; the last one again if it is young enough, as each visits all state.
+        if self._last_status is None or self.host.now() - self._last_status[0] >= parsed.message.max_age_s:
+            began = time.thread_time()
+            self._last_status = self.host.now(), answer_bytes(folded(self._status(core)))
+            self._status_cost_s = time.thread_time() - began
+        query.reply(self._last_status[1], lane_of(parsed.asker))
 
     def _serve_stored(self, core: Core, query: IncomingQuery, parsed: Parsed) -> None:
         self._reader.answer_read(parsed.message, answer_to(query, parsed.asker))
@@ -343,14 +348,6 @@ class Service:
                 )
         run = parsed.asker if parsed.subtree == "gw" else None
         self._reader.get(run, message, answer_to(query, parsed.asker))
-
-    def _status_bytes(self, core: Core, max_age_s: float) -> bytes:
-        """The status as a message; the last one again if it is young enough, as each visits all state."""
-        if self._last_status is None or self.host.now() - self._last_status[0] >= max_age_s:
-            began = time.thread_time()
-            self._last_status = self.host.now(), answer_bytes(folded(self._status(core)))
-            self._status_cost_s = time.thread_time() - began
-        return self._last_status[1]
 
     def _status(self, core: Core) -> StatusReply:
         now = self.host.now()

@@ -117,7 +117,10 @@ def collect(
         shrunk = False
         if not dry_run:
             for bounds in gone:
-                _delete(db, bounds)
+                # Deletes these rows in one short transaction, so that a running coordinator never waits long.
+                with db.transaction():
+                    for table in ("outcomes", "begun"):
+                        db.execute(f"DELETE FROM {table} WHERE grp >= ? AND grp < ?", bounds)
             for run in old_runs:
                 db.execute("DELETE FROM train_blobs WHERE run = ?", (run,))
             for digest, found in unnamed.items():
@@ -204,13 +207,6 @@ def _size(db: Database, bounds: Bounds) -> tuple[int, int]:
     query = "SELECT COUNT(*), COALESCE(SUM(LENGTH(head) + LENGTH(data)), 0) FROM outcomes WHERE grp >= ? AND grp < ?"
     n, size = db.execute(query, bounds).fetchone()
     return n, int(size)
-
-
-def _delete(db: Database, bounds: Bounds) -> None:
-    """Deletes these rows in one short transaction, so that a running coordinator never waits long."""
-    with db.transaction():
-        for table in ("outcomes", "begun"):
-            db.execute(f"DELETE FROM {table} WHERE grp >= ? AND grp < ?", bounds)
 
 
 def _named(db: Database, old_runs: frozenset[str], old_evaluations: frozenset[str]) -> set[str]:

@@ -158,7 +158,12 @@ class Store:
             self._name(named)
             with self._db.batch():
                 for row in changed:
-                    _write_row(self._db, row)
+                    statement, values = _INSERTS[type(row)]
+                    self._db.execute(statement, [value(row) for value in values])
+                    if isinstance(row, records.OutcomeRow) and (run := train_run(row.group)) is not None:
+                        insert = "INSERT INTO train_blobs VALUES (?, ?) ON CONFLICT DO NOTHING"
+                        for ref in stored_blobs(row.outcome):
+                            self._db.execute(insert, (run, ref.digest))
 
     def _name(self, digests: list[str]) -> None:
         """Keeps these blobs from being collected from an object store. Raises StorageError when one has been."""
@@ -383,14 +388,6 @@ def _insert_of(place: _Place) -> tuple[str, tuple[Callable[[Any], object], ...]]
 
 
 _INSERTS = {kind: _insert_of(_PLACES[kind]) for kind in get_args(records.Row)}
-
-
-def _write_row(db: Database, row: records.Row) -> None:
-    statement, values = _INSERTS[type(row)]
-    db.execute(statement, [value(row) for value in values])
-    if isinstance(row, records.OutcomeRow) and (run := train_run(row.group)) is not None:
-        for ref in stored_blobs(row.outcome):
-            db.execute("INSERT INTO train_blobs VALUES (?, ?) ON CONFLICT DO NOTHING", (run, ref.digest))
 
 
 def train_run(group: str) -> str | None:

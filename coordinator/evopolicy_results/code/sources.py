@@ -86,7 +86,9 @@ def reachable_modules(files: Mapping[str, bytes]) -> dict[str, Module]:
             continue
         module = modules[name] = Module(name, path, files[path], parsed(files[path]))
         for target in _imported(module, path.endswith("__init__.py")):
-            queue += _prefixes(target, depth)
+            # The prefixes of a dotted name with at most `depth` parts: `import a.a.a…` may have any number.
+            parts = target.split(".", depth)[:depth]
+            queue += [".".join(parts[: i + 1]) for i in range(len(parts))]
     return dict(sorted(modules.items()))
 
 
@@ -105,12 +107,6 @@ def _module_name(path: str) -> str:
     if parts[-1] == "__init__" and len(parts) > 1:
         parts.pop()
     return ".".join(parts)
-
-
-def _prefixes(dotted: str, depth: int) -> list[str]:
-    """The prefixes of a dotted name with at most `depth` parts: `import a.a.a…` may have any number."""
-    parts = dotted.split(".", depth)[:depth]
-    return [".".join(parts[: i + 1]) for i in range(len(parts))]
 
 
 def _imported(module: Module, is_package: bool) -> set[str]:

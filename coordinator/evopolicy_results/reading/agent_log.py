@@ -143,7 +143,9 @@ def _events_of(value: dict[str, object]) -> Iterator[LogEvent]:
         if part.kind == "call":
             yield _call(part.value, at)
         elif part.kind == "result":
-            yield LogEvent(answered=_answered_submits(part.value), at=at)
+            numbers = (match[1] for text in _strings(part.value) for match in _ANSWER.finditer(text))
+            answered = dict.fromkeys(int(number) for number in numbers if len(number) <= 9)
+            yield LogEvent(answered=tuple(answered), at=at)
         elif part.kind in ("text", "stdout") and part.by_agent and isinstance(part.value, str):
             named = _NAMED.match(part.value) if part.kind == "stdout" else None
             yield LogEvent(message=_clip(part.value), answered=(int(named[1]),) if named else (), at=at)
@@ -167,11 +169,6 @@ def _images(text: str) -> Iterator[str]:
 
 def _is_short(path: str) -> bool:
     return len(path) <= _MAX_PATH_CHARS
-
-
-def _answered_submits(output: object) -> tuple[int, ...]:
-    numbers = (match[1] for text in _strings(output) for match in _ANSWER.finditer(text))
-    return tuple(dict.fromkeys(int(number) for number in numbers if len(number) <= 9))
 
 
 def _strings(value: object, depth: int = 0) -> list[str]:

@@ -99,7 +99,13 @@ def difference(first: Floats, second: Floats, *, resamples: int = RESAMPLES) -> 
     by_case = first.mean(axis=0) - second.mean(axis=0)
     if len(first) < 2 or len(second) < 2:
         returns = (first, second) if len(first) == len(second) == 1 else ()
-        return _with_p(over_cases(by_case, returns, resamples=resamples), len(by_case))
+        # Few resamples have no small quantiles, so the tail of the p value is that of Student's t, on the scale of the
+        # 95 % quantile.
+        estimate, n = over_cases(by_case, returns, resamples=resamples), len(by_case)
+        if estimate.low is None or estimate.method != "bootstrap-t":
+            return estimate
+        t = abs(estimate.value) / (estimate.value - estimate.low) * t_quantile(1.0 - ALPHA / 2.0, n - 1)
+        return replace(estimate, p=t_two_sided(t, n - 1))
     return _crossed(float(first.mean() - second.mean()), [components(first), components(second)], by_case)
 
 
@@ -161,15 +167,6 @@ def stratified(strata: Sequence[Stratum], weights: Sequence[float], over: Over) 
         return Estimate(value=value, over=over, reason="no spread")
     shares = [(v / total) ** 2 / each.df for v, each in zip(variances, strata, strict=True) if v > 0.0]
     return _t_interval(value, total, 1.0 / sum(shares), "stratified t", over)
-
-
-def _with_p(estimate: Estimate, n: int) -> Estimate:
-    """With the p value of a bootstrap of n cases. Few resamples have no small quantiles, so the tail is that of
-    Student's t, on the scale of the 95 % quantile."""
-    if estimate.low is None or estimate.method != "bootstrap-t":
-        return estimate
-    t = abs(estimate.value) / (estimate.value - estimate.low) * t_quantile(1.0 - ALPHA / 2.0, n - 1)
-    return replace(estimate, p=t_two_sided(t, n - 1))
 
 
 def _crossed(value: float, parts: Sequence[Components], by_case: Floats) -> Estimate:

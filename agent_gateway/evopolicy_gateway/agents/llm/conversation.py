@@ -131,7 +131,13 @@ class Conversation:
         for part in _parts(self.messages, ToolCallPart):
             part.__class__ = _AsSent
         self._known = ModelRequestParameters(function_tools=[_TOOL])
-        self._system = (settings["system"] or SYSTEM) + _skills(settings.get("skills", ()))
+        listed = []  # of each skill the path and the describing header, not the whole text
+        for path in settings.get("skills", ()):
+            text = Path(path).expanduser().read_text(errors="replace")
+            headed = text.startswith("---\n")
+            header = text.removeprefix("---\n").partition("\n---" if headed else "\n")[0]
+            listed.append(f"\n\n{path}\n{header.strip()[:_MAX_HEADER]}")
+        self._system = (settings["system"] or SYSTEM) + (_SKILLS + "".join(listed) if listed else "")
 
     def dumped(self) -> bytes:
         messages = ModelMessagesTypeAdapter.dump_python(self.messages, mode="json")
@@ -261,17 +267,6 @@ def _words(body: object) -> str:
                 (body[name] for name in ("error", "message", "detail") if body.get(name)), json.dumps(body)
             )
     return body if isinstance(body, str) else ""
-
-
-def _skills(paths: Sequence[str]) -> str:
-    """The part of the system prompt that lists skills: path and describing header of each file, not the whole text."""
-    listed = []
-    for path in paths:
-        text = Path(path).expanduser().read_text(errors="replace")
-        headed = text.startswith("---\n")
-        header = text.removeprefix("---\n").partition("\n---" if headed else "\n")[0]
-        listed.append(f"\n\n{path}\n{header.strip()[:_MAX_HEADER]}")
-    return _SKILLS + "".join(listed) if listed else ""
 
 
 def _call(identity: str, name: str, arguments: object) -> Call:

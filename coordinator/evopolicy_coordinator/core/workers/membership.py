@@ -22,7 +22,7 @@ from evopolicy_coordinator.core.contract.records import WorkerRow
 from evopolicy_coordinator.core.isolation import conflicts, occupancies
 from evopolicy_coordinator.core.leasing import fleet, leases, pins
 from evopolicy_coordinator.core.leasing.jobs import JobFailure
-from evopolicy_coordinator.core.tables.model import JobState, Profile, Worker
+from evopolicy_coordinator.core.tables.model import Profile, Worker
 from evopolicy_coordinator.core.tables.state import State
 from evopolicy_coordinator.core.tables.step import ResultsPersisted, Step
 from evopolicy_coordinator.core.workers import scheduler
@@ -189,7 +189,11 @@ def check_due(state: State, name: str, step: Step) -> None:
     deadlines = [] if worker.state == "lost" else [silent_at]
     for lease in list(worker.leases.values()):
         due = lease.renewed + settings.lease_ttl_s if lease.orphan_until is None else lease.orphan_until
-        overdue = (lease.started_at or lease.granted_at) + _longest_s(state, lease.job)
+        # For each episode of a job the policy's limits plus `job_deadline_s`, the coordinator's own bound, which
+        # also covers the wait in a batch.
+        limits = lease.job.group.template.limits
+        each_s = limits.episode_wall_s + limits.init_wall_s + settings.job_deadline_s
+        overdue = (lease.started_at or lease.granted_at) + lease.job.n * each_s
         if now >= overdue and lease.live:
             leases.stop(state, lease, step)
             leases.give_back(state, lease.job, "overdue", worker, step, ran=True)
@@ -203,14 +207,6 @@ def check_due(state: State, name: str, step: Step) -> None:
             deadlines.append(min(due, overdue) if lease.live else due)
     if deadlines:
         state.timers.arm(("worker", worker.name), min(deadlines))
-
-
-def _longest_s(state: State, job: JobState) -> float:
-    """Longest time that a job may be held, seconds: for each episode the policy's limits plus `job_deadline_s`, the
-    coordinator's own bound, which also covers the wait in a batch."""
-    limits = job.group.template.limits
-    each = limits.episode_wall_s + limits.init_wall_s + state.settings.job_deadline_s
-    return job.n * each
 
 
 def lose(state: State, worker: Worker, step: Step) -> None:

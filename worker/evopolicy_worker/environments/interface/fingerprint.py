@@ -41,21 +41,17 @@ _SHARED = (
 
 def fingerprint() -> Fingerprint:
     """This worker's fingerprint. Packages that are not installed are left out."""
-    return Fingerprint(
-        code_version=f"{evopolicy_common.__version__}+{_source_digest()[:12]}",
-        python=platform.python_version(),
-        packages=versions(PACKAGES),
-        cpu=f"{platform.machine()} {_simd_features()}",
-    )
-
-
-def _source_digest() -> str:
-    """SHA-256 over the worker's and the common package's own sources."""
+    # SHA-256 over the worker's and the common package's own sources.
     digest = hashlib.sha256()
     for root in (Path(evopolicy_common.__path__[0]), _ROOT):
         for path in sorted(path for path in root.rglob("*") if path.suffix in (".py", ".toml", ".md")):
             digest.update(str(path.relative_to(root)).encode() + b"\0" + path.read_bytes() + b"\0")
-    return digest.hexdigest()
+    return Fingerprint(
+        code_version=f"{evopolicy_common.__version__}+{digest.hexdigest()[:12]}",
+        python=platform.python_version(),
+        packages=versions(PACKAGES),
+        cpu=f"{platform.machine()} {_simd_features()}",
+    )
 
 
 def _simd_features() -> str:

@@ -77,7 +77,11 @@ def to_schema(space: gymnasium.Space[Any]) -> SpaceSchema:
         edges = None if space.edge_space is None else to_schema(space.edge_space)
         return {"type": "Graph", "node_space": to_schema(space.node_space), "edge_space": edges}
     if hasattr(space, "mission_func"):
-        return _mission(space)
+        # MiniGrid's sentence of a fixed pattern: as short and as long as its placeholders make it.
+        mission: Any = space
+        choices = mission.ordered_placeholders or []
+        lengths = [len(mission.mission_func(*words)) for words in itertools.product(*choices)]
+        return {"type": "Text", "min_length": min(lengths), "max_length": max(lengths)}
     raise TypeError(
         f"a space of type {type(space).__name__} ({str(space)[:200]}) has no form here: known are Box, Discrete,"
         " MultiDiscrete, MultiBinary, Text, Dict, Tuple, Sequence, Graph and OneOf; put a wrapper around the"
@@ -228,13 +232,6 @@ def _box(shape: tuple[int, ...], dtype: Any, low: NDArray[Any], high: NDArray[An
 def _bound(values: NDArray[Any]) -> Any:
     shared = values.size > MAX_LISTED_BOUNDS and bool((values == values.flat[0]).all())
     return _plain(values.flat[0].item() if shared else values.tolist())
-
-
-def _mission(space: Any) -> SpaceSchema:
-    """MiniGrid's sentence of a fixed pattern: as short and as long as its placeholders make it."""
-    choices = space.ordered_placeholders or []
-    lengths = [len(space.mission_func(*words)) for words in itertools.product(*choices)]
-    return {"type": "Text", "min_length": min(lengths), "max_length": max(lengths)}
 
 
 def _plain(value: Any) -> Any:

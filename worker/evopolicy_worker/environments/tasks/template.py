@@ -58,7 +58,12 @@ def text(about: About) -> str:
     )
     if is_shipped(entry.id):
         return _in_sections(about, rewards if components else _REWARD)
-    documentation = _documentation(env)
+    # The docstring of the environment's class, with headings two levels down; empty when the class has none of
+    # its own.
+    text = clean(inspect.getdoc(type(env.unwrapped)) or "") if "__doc__" in vars(type(env.unwrapped)) else ""
+    if len(text) > MAX_DOCUMENTATION:
+        text = text[:MAX_DOCUMENTATION].rpartition("\n")[0] + "\n\n(The documentation goes on.)"
+    documentation = re.sub(r"^(#+) ", r"##\1 ", text.strip(), flags=re.MULTILINE)
     parts = [
         f"# {entry.label}",
         "Maximise the sum of rewards of an episode.",
@@ -78,7 +83,9 @@ def _in_sections(about: About, rewards: str) -> str:
     them has a text of these."""
     entry, env, obs_space, action_space, _, limit, own = about
     grouped = _of_groups(entry, own)
-    written = {**_sections(_family_text(entry.family)), **own, **grouped}
+    name = f"family_{entry.family}.md"
+    of_family = read_text(name) if files(__package__).joinpath(name).is_file() else ""
+    written = {**_sections(of_family), **own, **grouped}
     acted = written.get("Action", "")
     # A table that a family writes covers a space of one part.
     listed = "|" in acted and action_space["type"] in ("Box", "Discrete", "MultiBinary")
@@ -177,12 +184,6 @@ def _joined(texts: list[str], section: str) -> str:
     return "\n\n".join(filter(None, (*before, table, *after)))
 
 
-def _family_text(family: str) -> str:
-    """The text written for all environments of a family; empty when there is none."""
-    name = f"family_{family}.md"
-    return read_text(name) if files(__package__).joinpath(name).is_file() else ""
-
-
 @cache
 def load(name: str) -> dict[str, Any]:
     """The tables of a TOML file of this folder."""
@@ -218,15 +219,6 @@ def _sections(text: str) -> dict[str, str]:
 def clean(given: str) -> str:
     """A third-party text without control characters and invisible marks."""
     return _UNSEEN.sub("", given.replace("\r\n", "\n"))
-
-
-def _documentation(env: gymnasium.Env[Any, Any]) -> str:
-    """The docstring of the environment's class, with headings two levels down; empty when the class has none of its
-    own."""
-    text = clean(inspect.getdoc(type(env.unwrapped)) or "") if "__doc__" in vars(type(env.unwrapped)) else ""
-    if len(text) > MAX_DOCUMENTATION:
-        text = text[:MAX_DOCUMENTATION].rpartition("\n")[0] + "\n\n(The documentation goes on.)"
-    return re.sub(r"^(#+) ", r"##\1 ", text.strip(), flags=re.MULTILINE)
 
 
 def _space(space: SpaceSchema) -> str:
