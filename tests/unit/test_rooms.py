@@ -149,7 +149,7 @@ CORE_LAYERS = (
     ("agents",),
     ("workers",),
     ("runs",),
-    ("loading", "status", "machine"),
+    ("status", "machine"),
 )
 """From the ground up, as in ARCHITECTURE.md."""
 

@@ -22,7 +22,7 @@ from typing import Any, cast
 
 import msgspec
 
-from evopolicy_common.errors import ConfigError, EvopolicyError, StorageError, TransportError
+from evopolicy_common.errors import ConfigError, EvopolicyError, RefusedError, StorageError, TransportError
 from evopolicy_common.messages import gateway
 from evopolicy_common.messages.operator import RunFinished, SubmitResult
 from evopolicy_common.processes.preflight import foreseen
@@ -30,18 +30,17 @@ from evopolicy_common.processes.scratch import remove_tree
 from evopolicy_common.records import account, model_record
 from evopolicy_common.records import run_record as schema
 from evopolicy_common.records.account import Claims
-from evopolicy_common.records.blobs import BlobStore, write_atomically
+from evopolicy_common.records.blobs import BlobStore, digest_of, write_atomically
 from evopolicy_common.records.code_metrics import CodeMetrics
 from evopolicy_common.records.open_run import Rejected, Requested
 from evopolicy_common.records.policies import bundles, checkpoints
 from evopolicy_common.records.policies.bundles import Bundle
 from evopolicy_common.records.policies.checkpoints import CheckpointMeta
-from evopolicy_common.records.run_record import RunRecord, encode_run_record, sha256_text
+from evopolicy_common.records.run_record import Replay, RunRecord, encode_run_record, sha256_text
 from evopolicy_common.records.secrets import without_keys
 from evopolicy_common.records.summary import utc_text
 from evopolicy_gateway.harnesses.coding_agents import session
 from evopolicy_gateway.relay import limits as model_limits
-from evopolicy_gateway.run import replays
 from evopolicy_gateway.run.operations import Operations
 from evopolicy_gateway.run.plan import Plan
 from evopolicy_gateway.run.times import Times
@@ -132,7 +131,7 @@ async def write(
         known["gave_up"] = error not in (None, INTERRUPTED)
         known["error"] = error or finished.error or CANCELLED
     with optional("the recordings of held-out episodes"):
-        known["replays"] = await replays.fetch(folder.root, finished, operations)
+        known["replays"] = await fetch_replays(folder.root, finished, operations)
 
     def finish() -> RunRecord:
         staged = saved(folder.staged, Staged) if folder.staged.exists() else None
@@ -337,3 +336,31 @@ def _put_in_place(system: Path, bundle: Bundle) -> None:
     else:
         system.unlink(missing_ok=True)
     bundles.unpack(bundle, system)
+
+
+async def fetch_replays(root: Path, finished: RunFinished, operations: Operations) -> tuple[Replay, ...]:
+    """Writes `replays/heldout_NNN/video.mp4` below the run directory `root`; returns one `Replay` each in the split's
+    order. NNN is the position in the split: the case's seed appears nowhere. A recording that a worker could not make,
+    or that the cluster no longer has, is left out; one that is in place is not fetched again."""
+    index = finished.best_submit_index
+    if finished.settings.recorded_heldout == "off" or index is None:
+        return ()
+    recordings: list[Replay] = []
+    async for outcome in operations.recorded(finished.run, "heldout", index):
+        if outcome.video is None:
+            continue
+        path = f"replays/heldout_{outcome.index:03d}/video.mp4"
+        target = root / path
+        data = await asyncio.to_thread(target.read_bytes) if target.is_file() else b""
+        if digest_of(data) != outcome.video.digest:
+            try:
+                data = await operations.fetch(outcome.video)
+            except RefusedError:
+                continue
+            target.parent.mkdir(parents=True, exist_ok=True)
+            await asyncio.to_thread(write_atomically, target, data)
+        known: dict[str, Any] = {"episode_return": outcome.episode_return, "length": outcome.length}
+        recordings.append(
+            Replay(path=path, split="heldout", episode=outcome.index, submit_index=index, **known)
+        )
+    return tuple(sorted(recordings, key=lambda replay: replay.episode))

@@ -7,7 +7,7 @@ these tables the module owns one rule: a late call of the loop expires no lease.
 
 from __future__ import annotations
 
-from collections import deque
+from collections import defaultdict, deque
 from collections.abc import Callable, Mapping
 from typing import Any, TypeVar
 
@@ -15,21 +15,25 @@ from evopolicy_common.messages import gateway, operator
 from evopolicy_common.messages import worker as wire
 from evopolicy_common.messages.status import StatusReply
 from evopolicy_common.messages.worker import Message
-from evopolicy_coordinator.core import loading, status
+from evopolicy_coordinator.core import status
 from evopolicy_coordinator.core.agents import permits, precedence, requests
 from evopolicy_coordinator.core.contract import events
 from evopolicy_coordinator.core.contract.effects import Effect
 from evopolicy_coordinator.core.contract.reasons import NotDoneError, Reason
-from evopolicy_coordinator.core.contract.records import Snapshot
+from evopolicy_coordinator.core.contract.records import (
+    Snapshot,
+    SubmitRow,
+    submit_group,
+)
 from evopolicy_coordinator.core.contract.settings import CoreSettings
 from evopolicy_coordinator.core.isolation import occupancies
-from evopolicy_coordinator.core.leasing import fleet, queue
+from evopolicy_coordinator.core.leasing import fleet, pins, queue
 from evopolicy_coordinator.core.runs import evaluations, finalisation, finished, journal, runs, submits
 from evopolicy_coordinator.core.status import Words
 from evopolicy_coordinator.core.tables import step
-from evopolicy_coordinator.core.tables.model import LaneKey
-from evopolicy_coordinator.core.tables.state import State
-from evopolicy_coordinator.core.tables.step import Step
+from evopolicy_coordinator.core.tables.model import LaneKey, Run
+from evopolicy_coordinator.core.tables.state import Loading, State
+from evopolicy_coordinator.core.tables.step import EpisodesDone, Step
 from evopolicy_coordinator.core.workers import membership, results, scheduler
 
 TICK_S = 1.0
@@ -51,7 +55,7 @@ class Core:
         """Returns a core that continues from the snapshot, and the first effects to carry out."""
         core = cls(settings, snapshot.incarnation, now)
         first = Step(now, f"load-{snapshot.incarnation}")
-        loading.load(core.state, snapshot, first, drain)
+        load(core.state, snapshot, first)
         return core, core._end(first)
 
     def handle(self, event: events.AnyEvent, now: float) -> list[Effect]:
@@ -240,3 +244,87 @@ TIMERS: dict[str, Rule] = {
     "cancelled": permits.agent_ended,
 }
 """The rule for each deadline: by its kind; the rule gets the deadline's subject."""
+
+
+def load(state: State, snapshot: Snapshot, step: Step) -> None:
+    """Fill an empty state so that no accepted submit is lost and no finished episode is played again.
+
+    Budgets are rebuilt from submits, open groups from submits and outcomes; groups that were complete but not concluded
+    when the process died are concluded first. Open jobs may be running on a worker: they wait for a short while for
+    heartbeats that claim them.
+    """
+    loading = state.loading = Loading()
+    state.journal = snapshot.journal
+    state.revealed.update(snapshot.revealed)
+    for head in snapshot.outcomes:
+        loading.heads.setdefault(head.group, []).append(head)
+    loading.begun.update({(row.group, row.first): row for row in snapshot.begun})
+    for worker in snapshot.workers:
+        fleet.set_state(state, worker.worker, worker.state)
+    stored = {row.run: row for row in snapshot.states}
+    permits.load(state, snapshot.permits, {row.run: row for row in snapshot.runs}, stored, step)
+    occupancies.load(state, snapshot.kernels, step)
+    submits_of: dict[str, list[SubmitRow]] = defaultdict(list)
+    for submit in snapshot.submits:
+        submits_of[submit.run].append(submit)
+    for row in sorted(snapshot.runs, key=lambda row: (row.created_at, row.run)):
+        last = stored[row.run]
+        if last.phase == "finished":
+            state.run_keys[row.key] = row.run
+            state.capabilities[row.run] = row.capability
+            state.finished[row.run] = runs.last_state(last)
+        else:
+            run = runs.enter(state, row, last)
+            requests.resume(state, run, step)
+            _run(state, run, submits_of[row.run], loading, step)
+    for each in sorted(snapshot.evaluations, key=lambda row: (row.created_at, row.evaluation)):
+        if each.finished:
+            state.evaluation_keys[each.key] = each.evaluation
+            state.ended_evaluations[each.evaluation] = len(each.cases)
+            continue
+        evaluation = evaluations.enter(state, each)
+        if each.fingerprint_class is not None:
+            pins.place(state, evaluation.flow, each.fingerprint_class, step)
+        evaluations.queue_jobs(state, evaluation, step)
+    while loading.reloaded:
+        group = loading.reloaded.pop(0)
+        if group.done and not group.closed:
+            step.tell(EpisodesDone(group, None, ()))
+            drain(state, step)
+    state.loading = None
+    if state.adopting:
+        state.timers.arm(("adopt", ""), step.now + state.settings.adoption_s)
+    step.log("info", "core_loaded", incarnation=state.incarnation, runs=len(state.runs), jobs=len(state.jobs))
+
+
+def _run(state: State, run: Run, rows: list[SubmitRow], loading: Loading, step: Step) -> None:
+    if run.state.fingerprint_class is not None:
+        pins.place(state, run.flow, run.state.fingerprint_class, step)
+        run.flow.description = run.state.description
+    for row in sorted(rows, key=lambda row: row.submit_index):
+        run.submits.append(row)
+        run.keys[row.key] = row.submit_index
+        if not row.env_instances:
+            continue
+        run.ledger.reserve(row.submit_index, len(row.env_instances))
+        if row.refunded:
+            run.ledger.refund(row.submit_index)
+        elif row.status is not None:
+            run.ledger.settle(row.submit_index)
+            _spent(run, row)
+        else:
+            run.open = row.submit_index
+            submits.queue_jobs(state, run, row, step)
+        if row.status == "ok" and row.val_mean is not None:
+            heads = loading.heads.pop(submit_group(run.id, row.submit_index, "validation"), [])
+            failed = sum(head.failure is not None for head in heads)
+            run.hidden_failures[submit_group(run.id, row.submit_index, "validation")] = failed
+    finalisation.advance(state, run, step)
+
+
+def _spent(run: Run, row: SubmitRow) -> None:
+    """Add a settled submit's queue and rollout time to the run's totals, as at its end."""
+    if row.completed_at is not None:
+        started_at = row.first_leased_at or row.completed_at
+        run.queue_s += max(0.0, started_at - row.accepted_at)
+        run.rollout_s += max(0.0, row.completed_at - started_at)

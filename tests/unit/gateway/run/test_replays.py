@@ -15,7 +15,7 @@ from evopolicy_common.errors import RefusedError, TransportError
 from evopolicy_common.messages.episode import BlobRef, EpisodeOutcome
 from evopolicy_common.messages.operator import RunFinished
 from evopolicy_common.records.blobs import digest_of
-from evopolicy_gateway.run import replays
+from evopolicy_gateway.run.record import fetch_replays
 
 MP4 = [b"mp4 %d" % index for index in range(3)]
 
@@ -56,7 +56,7 @@ def run_with(**settings: Any) -> RunFinished:
 
 
 def fetch(root: Path, run: RunFinished, cluster: Cluster) -> Any:
-    return asyncio.run(replays.fetch(root, run, cluster))  # type: ignore[arg-type]
+    return asyncio.run(fetch_replays(root, run, cluster))  # type: ignore[arg-type]
 
 
 def test_recordings_are_written_and_told_in_the_splits_order(tmp_path: Path) -> None:
