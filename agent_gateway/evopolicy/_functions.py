@@ -12,7 +12,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from evopolicy_common.errors import BundleError, ConfigError
+from evopolicy_common.errors import BundleError, ConfigError, raised_as
 from evopolicy_common.processes.preflight import check_installed
 from evopolicy_common.records.policies import bundles
 
@@ -63,10 +63,8 @@ def policy_of(function: Callable[..., Any]) -> bundles.Bundle:
     for path in Path(cloudpickle.__file__).parent.glob("*.py"):
         code[f"cloudpickle/{path.name}"] = path.read_bytes()
     bundle = bundles.pack([bundles.BundleFile(name, False, data) for name, data in code.items()])
-    try:
+    with raised_as(ConfigError, f"policy {name_of(function)}, with the values that it uses", BundleError):
         return bundles.load(bundle.packed, bundle.digest)
-    except BundleError as error:
-        raise ConfigError(f"policy {name_of(function)}, with the values that it uses: {error}") from error
 
 
 def _pickled(function: Callable[..., Any], role: str, place: str) -> bytes:

@@ -6,6 +6,8 @@ operators and never reach an agent.
 
 from __future__ import annotations
 
+import contextlib
+from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, Any
 
 from evopolicy_common.refusals import Refusal
@@ -99,3 +101,14 @@ class LeadLostError(StorageError):
 
 class DamagedStoreError(StorageError):
     """Stored data cannot be read or contradict each other; a retry does not help."""
+
+
+@contextlib.contextmanager
+def raised_as(
+    kind: Callable[[str], Exception], problem: object, *causes: type[Exception], remedy: str = ""
+) -> Iterator[None]:
+    """Raises errors of `causes` in its body as a `kind` with the problem, the reason and the remedy as text."""
+    try:
+        yield
+    except causes as error:
+        raise kind(f"{problem}: {getattr(error, 'strerror', None) or error}{remedy}") from error

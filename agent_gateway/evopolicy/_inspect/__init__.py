@@ -36,7 +36,7 @@ from evopolicy._cluster import Cluster, plan_of
 from evopolicy._loop import awaited
 from evopolicy._runs import Run
 from evopolicy_common import catalogue
-from evopolicy_common.errors import ConfigError, EvopolicyError
+from evopolicy_common.errors import ConfigError, EvopolicyError, raised_as
 from evopolicy_common.processes import proc
 from evopolicy_common.records.words import in_words
 from evopolicy_gateway.agents.client import Client, ProtocolError, Refusal
@@ -282,15 +282,12 @@ def read_file() -> Tool:
             offset: Bytes to skip.
         """
         place = _inside(path, ".")
-        try:
-            with place.open("rb") as file:
-                size = file.seek(0, os.SEEK_END)
-                begin = min(max(0, offset), size)
-                file.seek(begin)
-                data = file.read(_MAX_READ)
-                rest = size - begin - len(data)
-        except OSError as error:
-            raise ToolError(f"{path}: {error.strerror}") from error
+        with raised_as(ToolError, path, OSError), place.open("rb") as file:
+            size = file.seek(0, os.SEEK_END)
+            begin = min(max(0, offset), size)
+            file.seek(begin)
+            data = file.read(_MAX_READ)
+            rest = size - begin - len(data)
         text = data.decode("utf-8", "replace")
         return f"{text}\n[{rest} more bytes]" if rest > 0 else text
 
@@ -309,11 +306,9 @@ def write_file() -> Tool:
         place = _inside(path, "system")
         if len(content) > _MAX_WRITTEN:
             raise ToolError(f"{path}: {len(content)} characters; at most {_MAX_WRITTEN}")
-        try:
+        with raised_as(ToolError, path, OSError):
             place.parent.mkdir(parents=True, exist_ok=True)
             place.write_text(content, encoding="utf-8", errors="replace")
-        except OSError as error:
-            raise ToolError(f"{path}: {error.strerror}") from error
         return f"wrote {path}"
 
     return execute

@@ -29,7 +29,7 @@ from starlette.routing import Route
 
 from evopolicy_common.cli.conventions import end_on_sigterm, fail_on_our_errors, run_to_end
 from evopolicy_common.cli.frame import App
-from evopolicy_common.errors import ConfigError, EvopolicyError
+from evopolicy_common.errors import ConfigError, EvopolicyError, raised_as
 from evopolicy_common.messages.operator import CreateRun
 from evopolicy_common.records.blobs import write_atomically
 from evopolicy_common.records.run_files import read_record
@@ -246,10 +246,8 @@ def harbor(
 
 async def _serve(listener: Listener, runs: list[Path], tasks: Path, agent_s: float) -> None:
     end_on_sigterm()
-    try:
+    with raised_as(ConfigError, "--http: cannot listen there", OSError):
         sock = bound(listener.host, listener.port)
-    except OSError as error:
-        raise ConfigError(f"--http: cannot listen there: {error.strerror or error}") from error
     url = listener.url or base_url(listener.host, sock.getsockname()[1])
     for run in runs:
         say(f"written: {write_task(tasks, run, url, agent_s)}")

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import msgspec
 
-from evopolicy_common.errors import ConfigError
+from evopolicy_common.errors import ConfigError, raised_as
 from evopolicy_gateway import shipped
 from evopolicy_gateway.harnesses.coding_agents import llm
 from evopolicy_gateway.harnesses.coding_agents.acp import AcpAgent
@@ -183,10 +183,8 @@ def _ours(module: str) -> list[str]:
 
 
 def _split(command: str) -> list[str]:
-    try:
+    with raised_as(ConfigError, f"--agent command:{command}", ValueError):
         return shlex.split(command)
-    except ValueError as error:
-        raise ConfigError(f"--agent command:{command}: {error}") from error
 
 
 def _program(agent: str, words: list[str], started_in: Path) -> list[str]:

@@ -16,7 +16,7 @@ from typing import Any
 
 import orjson
 
-from evopolicy_common.errors import ConfigError
+from evopolicy_common.errors import ConfigError, raised_as
 from evopolicy_gateway.agents import replay
 from evopolicy_gateway.harnesses.interface.base import Harness, Stage
 from evopolicy_gateway.processes.agent_process import AgentProcess
@@ -99,10 +99,8 @@ class ReplayHarness(CommandHarness):
 
     def check(self, env: str) -> None:
         folder = replay.folder_for(self._folder, env)
-        try:
+        with raised_as(ConfigError, f"--agent replay: cannot read {folder}", OSError):
             policies = replay.policies_in(folder)
-        except OSError as error:
-            raise ConfigError(f"--agent replay: cannot read {folder}: {error.strerror}") from error
         if not policies:
             raise ConfigError(
                 f"--agent replay: {folder} holds no policy; name a folder with policy.py in it, or with folders that"

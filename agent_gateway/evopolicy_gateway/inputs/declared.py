@@ -18,7 +18,7 @@ from typing import NamedTuple
 
 import msgspec
 
-from evopolicy_common.errors import ConfigError
+from evopolicy_common.errors import ConfigError, raised_as
 from evopolicy_common.records.run_record import AgentInput
 from evopolicy_common.regular_files import open_regular
 from evopolicy_gateway.jail.settings import host
@@ -114,11 +114,8 @@ def _server(name: str, server: McpServer, started_in: Path) -> Content:
     if program is None:
         why = f"there is no program {server.command!r}, neither as a file nor on the PATH"
         raise ConfigError(f"{field}.command: {why}")
-    try:
-        with open(program, "rb") as file:
-            digest = hashlib.file_digest(file, "sha256").hexdigest()
-    except OSError as error:
-        raise ConfigError(f"{program} cannot be read: {error.strerror}") from error
+    with raised_as(ConfigError, f"{program} cannot be read", OSError), open(program, "rb") as file:
+        digest = hashlib.file_digest(file, "sha256").hexdigest()
     about = [os.path.basename(program), digest, words, sorted(server.environment.items())]
     recorded = AgentInput(kind="mcp", name=name, digest=_digest(files, about), hosts=server.hosts)
     return Content(recorded, files, Server(program, tuple(words), server.environment))
@@ -153,7 +150,7 @@ def _files(field: str, root: Path, prefix: str) -> Iterator[tuple[str, File]]:
     remaining, n, pending = MAX_BYTES, 0, [(root, prefix)]
     while pending:
         path, name = pending.pop()
-        try:
+        with raised_as(ConfigError, f"{field}: {path}", OSError):
             mode = path.lstat().st_mode
             if stat.S_ISDIR(mode):
                 pending += [
@@ -167,8 +164,6 @@ def _files(field: str, root: Path, prefix: str) -> Iterator[tuple[str, File]]:
                 raise ConfigError(f"{field}: {path} is {kind}")
             with open_regular(path) as file:
                 data = file.read(remaining + 1)
-        except OSError as error:
-            raise ConfigError(f"{field}: {path}: {error.strerror}") from error
         if any("\ud800" <= character <= "\udfff" for character in name):
             raise ConfigError(f"{field}: the name {str(path)!r} is not UTF-8; rename the file")
         remaining, n = remaining - len(data), n + 1

@@ -15,7 +15,7 @@ from rich.progress import Progress
 
 from evopolicy_common import catalogue
 from evopolicy_common.console import Terminal, table, terminal
-from evopolicy_common.errors import BundleError, ConfigError
+from evopolicy_common.errors import BundleError, ConfigError, raised_as
 from evopolicy_common.local.cluster import unless_failed
 from evopolicy_common.messages.environment import Split
 from evopolicy_common.messages.episode import EpisodeOutcome
@@ -184,10 +184,8 @@ def policy_bundle(policy: Path) -> bundles.Bundle:
         if policy.is_dir():
             problem = f"{policy} holds no policy.py"
         raise ConfigError(f"{problem}; name a folder with policy.py in it, or in its folder system/")
-    try:
+    with raised_as(ConfigError, folder, BundleError):
         return bundle_of(folder)
-    except BundleError as error:
-        raise ConfigError(f"{folder}: {error}") from error
 
 
 def _new_folder(out: Path, env: str) -> Path:

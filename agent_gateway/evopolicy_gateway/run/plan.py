@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import msgspec
 
 from evopolicy_common import catalogue
-from evopolicy_common.errors import ConfigError, EvopolicyError, ProtocolError
+from evopolicy_common.errors import ConfigError, EvopolicyError, ProtocolError, raised_as
 from evopolicy_common.messages.environment import StepLimit
 from evopolicy_common.messages.operator import CreateRun
 from evopolicy_common.messages.run_settings import RunSettings, Start
@@ -74,10 +74,8 @@ def read_prices(file: str | Path | None, config: AgentConfig | None, started_in:
     if file is None or config is None:
         return None
     path = shipped.found(file, started_in)
-    try:
+    with raised_as(ConfigError, f"--set prices={path}", msgspec.DecodeError, UnicodeDecodeError):
         tables = msgspec.toml.decode(read_given(path, f"--set prices={path}"), type=dict[str, Prices])
-    except (msgspec.DecodeError, UnicodeDecodeError) as error:
-        raise ConfigError(f"--set prices={path}: {error}") from error
     if config.model is None:
         raise ConfigError(
             f"--set prices={path}: the agent's model is not named; write it as in codex:gpt-5.5, or in its file"

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import msgspec
 
-from evopolicy_common.errors import DECODE_ERRORS, StorageError
+from evopolicy_common.errors import DECODE_ERRORS, StorageError, raised_as
 from evopolicy_common.records.blobs import fsync_directory
 from evopolicy_common.records.open_run import AnyLine, line_decoder
 
@@ -115,11 +115,9 @@ class Journal:
         whole = data.rfind(b"\n") + 1
         place = 0
         for number, line in enumerate(data[:whole].splitlines(keepends=True), start=1):
-            try:
+            with raised_as(StorageError, f"{self._path}, line {number}, is damaged", *DECODE_ERRORS):
                 self.entries[place] = line_decoder.decode(line)
                 place += len(line)
-            except DECODE_ERRORS as error:
-                raise StorageError(f"{self._path}, line {number}, is damaged: {error}") from error
         if whole != len(data):
             os.ftruncate(self._file.fileno(), whole)
 

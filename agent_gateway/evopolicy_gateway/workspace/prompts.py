@@ -12,7 +12,7 @@ from string import Template
 
 import msgspec
 
-from evopolicy_common.errors import DECODE_ERRORS, ConfigError
+from evopolicy_common.errors import DECODE_ERRORS, ConfigError, raised_as
 from evopolicy_common.regular_files import read_given
 
 FIRST = (
@@ -86,20 +86,16 @@ def left(wall_s: float, n_tokens: int) -> str:
 
 def read_prompts(path: Path) -> Prompts:
     """The prompts in a TOML file. Raises ConfigError that names the file and the fault."""
-    try:
+    with raised_as(ConfigError, path, *DECODE_ERRORS):
         prompts = msgspec.toml.decode(read_text(path), type=Prompts)
-    except DECODE_ERRORS as error:
-        raise ConfigError(f"{path}: {error}") from error
     prompts.check(str(path))
     return prompts
 
 
 def read_text(path: Path) -> str:
     """An operator's text. Raises ConfigError when the file cannot be read, is not UTF-8, or is over 256 KiB."""
-    try:
+    with raised_as(ConfigError, f"{path} is not UTF-8", UnicodeDecodeError):
         return read_given(path, str(path), _MAX_BYTES).decode()
-    except UnicodeDecodeError as error:
-        raise ConfigError(f"{path} is not UTF-8: {error}") from error
 
 
 def check_text(where: str, text: str, known: tuple[str, ...]) -> None:

@@ -16,7 +16,7 @@ from typing import Any, Literal
 
 import msgspec
 
-from evopolicy_common.errors import ConfigError
+from evopolicy_common.errors import ConfigError, raised_as
 from evopolicy_common.regular_files import read_given
 
 Demand = Literal["synthesis", "tuning"]
@@ -165,10 +165,8 @@ def _entry(path: Path, table: dict[str, object]) -> Entry:
     task_file = fields.pop("task_file", None)
     if task_file is not None:
         fields["task"] = _task(where, path, fields, task_file)
-    try:
+    with raised_as(ConfigError, where, msgspec.ValidationError):
         entry = msgspec.convert(fields, Entry)
-    except msgspec.ValidationError as error:
-        raise ConfigError(f"{where}: {error}") from error
     entry = msgspec.structs.replace(entry, data=_data(where, path, entry.data))
     if why := _fault(entry):
         raise ConfigError(f"{where}: {why}")
@@ -193,10 +191,8 @@ def _task(where: str, path: Path, fields: dict[str, object], task_file: object) 
         raise ConfigError(
             f"{what} is {place}, outside the environment file's folder {folder}: copy the text into that folder"
         )
-    try:
+    with raised_as(ConfigError, f"{what} is not UTF-8", UnicodeDecodeError, remedy="; save it as UTF-8"):
         return read_given(place, what, MAX_FILE_BYTES).decode()
-    except UnicodeDecodeError as error:
-        raise ConfigError(f"{what} is not UTF-8: {error}; save it as UTF-8") from error
 
 
 def _data(where: str, path: Path, names: tuple[str, ...]) -> tuple[str, ...]:

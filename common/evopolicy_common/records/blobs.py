@@ -16,7 +16,7 @@ import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from evopolicy_common.errors import ConfigError, StorageError
+from evopolicy_common.errors import ConfigError, StorageError, raised_as
 
 MAX_UNFINISHED = 16
 """Most unfinished uploads of one sender; beyond it the sender's oldest is dropped."""
@@ -64,12 +64,10 @@ def sync_filesystem(path: Path) -> None:
 def write_atomically(path: Path, data: bytes, *, mode: int = 0o644, durable: bool = True) -> None:
     """Replaces `path` by a file with `data`: readers see the old bytes or the new, never a part. Raises
     StorageError, and ConfigError when `path` is a pipe, a device or a folder."""
-    try:
+    with raised_as(StorageError, f"cannot write {path}", OSError):
         if path.exists() and not path.is_file():
             raise ConfigError(f"{path} is not a regular file; name another")
         fd, name = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
-    except OSError as error:
-        raise StorageError(f"cannot write {path}: {error.strerror or error}") from error
     try:
         with os.fdopen(fd, "wb") as file:
             file.write(data)
@@ -185,7 +183,7 @@ class BlobStore:
         if on_whole is None and self._touched(digest):
             return size
         part = self._parts / f"{_folded(sender)}-{digest}"
-        try:
+        with raised_as(StorageError, f"cannot write blob {digest}", OSError):
             have = part.stat().st_size if part.exists() else 0
             if offset == 0 and have:
                 part.unlink()
@@ -206,8 +204,6 @@ class BlobStore:
                         os.fsync(file.fileno())
             elif offset + len(data) != have:
                 return have
-        except OSError as error:
-            raise StorageError(f"cannot write blob {digest}: {error.strerror or error}") from error
         if have == size:
             # Also when the last chunk is sent again: the blob may not have been stored the first time.
             is_new = not self.has(digest)
@@ -287,11 +283,9 @@ class BlobStore:
 
     def _make_parent(self, path: Path) -> None:
         if not path.parent.is_dir():
-            try:
+            with raised_as(StorageError, f"cannot write {path.parent}", OSError):
                 path.parent.mkdir(exist_ok=True)
                 fsync_directory(self._root)
-            except OSError as error:
-                raise StorageError(f"cannot write {path.parent}: {error.strerror or error}") from error
 
 
 def _folded(sender: str) -> str:

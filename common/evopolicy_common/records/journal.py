@@ -20,7 +20,7 @@ from collections.abc import Iterable
 
 import msgspec
 
-from evopolicy_common.errors import DECODE_ERRORS, ProtocolError
+from evopolicy_common.errors import DECODE_ERRORS, ProtocolError, raised_as
 from evopolicy_common.messages.bounds import Int, Many, Number, Word
 from evopolicy_common.messages.environment import Case
 from evopolicy_common.messages.operator import RunResult
@@ -110,10 +110,8 @@ _entries: msgspec.json.Decoder[EpochEntry] = msgspec.json.Decoder(EpochEntry)
 
 def read_entry(data: bytes) -> EpochEntry:
     """Decodes an entry. Raises ProtocolError for bytes that this version does not know as an entry."""
-    try:
+    with raised_as(ProtocolError, "not an entry of a journal", *DECODE_ERRORS, ValueError):
         return _entries.decode(data)
-    except (*DECODE_ERRORS, ValueError) as error:
-        raise ProtocolError(f"not an entry of a journal: {error}") from error
 
 
 def commitment(salt: bytes, opening: bytes) -> str:

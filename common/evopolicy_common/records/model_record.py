@@ -21,7 +21,7 @@ from typing import Any, Literal
 import msgspec
 import zstandard
 
-from evopolicy_common.errors import DECODE_ERRORS, ConfigError
+from evopolicy_common.errors import DECODE_ERRORS, ConfigError, raised_as
 from evopolicy_common.regular_files import open_regular, read_regular
 
 Level = Literal["off", "digests", "full"]
@@ -86,13 +86,11 @@ class Pack:
         """Raises ConfigError for a file that is none."""
         self._path = folder / PACK
         self._places: dict[str, tuple[int, int]] = {}
-        try:
+        with raised_as(ConfigError, self._path, OSError):
             self._file = self._path.open("a+b", buffering=0) if writes else open_regular(self._path)
             self.size = self._index()
             if writes:
                 self._file.truncate(self.size)
-        except OSError as error:
-            raise ConfigError(f"{self._path}: {error.strerror or error}") from error
         self._packer = zstandard.ZstdCompressor(level=3)
 
     def _index(self) -> int:
@@ -149,10 +147,8 @@ class Pack:
 def read_calls(folder: Path) -> list[Call]:
     """The readable calls of a record, by their start. Raises ConfigError when there is no record."""
     path = folder / CALLS
-    try:
+    with raised_as(ConfigError, f"{path} cannot be read", OSError):
         lines = read_regular(path, MAX_CALLS * MAX_CALL_BYTES).splitlines()
-    except OSError as error:
-        raise ConfigError(f"{path} cannot be read: {error.strerror or error}") from error
     calls = []
     for line in lines:
         with contextlib.suppress(*DECODE_ERRORS):

@@ -15,7 +15,7 @@ from typing import Any, Literal
 
 import msgspec
 
-from evopolicy_common.errors import DECODE_ERRORS, ProtocolError
+from evopolicy_common.errors import DECODE_ERRORS, ProtocolError, raised_as
 from evopolicy_common.messages.bounds import check_plausible
 from evopolicy_common.messages.environment import Split
 from evopolicy_common.messages.episode import ResourceLimits, Tier
@@ -486,12 +486,10 @@ def encode_run_record(record: RunRecord) -> bytes:
 
 def decode_run_record(data: bytes) -> RunRecord:
     """The record in `data`. Raises ProtocolError when this version cannot read it, such as the published software's."""
-    try:
+    with raised_as(ProtocolError, "not a run record", *DECODE_ERRORS, AttributeError, TypeError, ValueError):
         header = _headers.decode(data)
         if header.schema_version == PUBLISHED_SCHEMA and header.record_version == RECORD_VERSION:
             return check_plausible(_runs.decode(data))
-    except (*DECODE_ERRORS, AttributeError, TypeError, ValueError) as error:
-        raise ProtocolError(f"not a run record: {error}") from error
     if header.schema_version == PUBLISHED_SCHEMA and header.record_version is None:
         raise ProtocolError(
             "run.json was written by the published software, not by evopolicy: only `evopolicy report` reads it"

@@ -12,7 +12,7 @@ from typing import Literal
 
 import msgspec
 
-from evopolicy_common.errors import DECODE_ERRORS, ProtocolError
+from evopolicy_common.errors import DECODE_ERRORS, ProtocolError, raised_as
 from evopolicy_common.messages.bounds import check_plausible
 from evopolicy_common.messages.gateway import SubmitStatus
 from evopolicy_common.records.code_metrics import PUBLISHED_SCHEMA
@@ -80,10 +80,8 @@ _decoder = msgspec.json.Decoder(Summary)
 
 def decode_summary(data: bytes) -> Summary:
     """The summary in `data`; unknown fields are skipped. Raises ProtocolError when this version cannot read it."""
-    try:
+    with raised_as(ProtocolError, "not a submit summary", *DECODE_ERRORS, ValueError):
         summary = check_plausible(_decoder.decode(data))
-    except (*DECODE_ERRORS, ValueError) as error:
-        raise ProtocolError(f"not a submit summary: {error}") from error
     if summary.schema_version != SCHEMA_VERSION:
         raise ProtocolError(
             f"summary has schema_version {summary.schema_version}, this version reads {SCHEMA_VERSION}: use"

@@ -23,7 +23,7 @@ from typing import Literal
 
 import msgspec
 
-from evopolicy_common.errors import DECODE_ERRORS, ConfigError
+from evopolicy_common.errors import DECODE_ERRORS, ConfigError, raised_as
 from evopolicy_common.records.blobs import digest_of, write_atomically
 from evopolicy_common.records.open_run import is_held
 from evopolicy_common.regular_files import read_given
@@ -86,10 +86,8 @@ def read_credentials(path: Path) -> Credentials:
     """The credentials in `path`, with absolute paths. Raises ConfigError if missing, malformed or not
     private."""
     data = _read_private(path)
-    try:
+    with raised_as(ConfigError, f"{path} is not a credentials file", *DECODE_ERRORS):
         credentials = msgspec.json.decode(data, type=Credentials)
-    except DECODE_ERRORS as error:
-        raise ConfigError(f"{path} is not a credentials file: {error}") from error
     if credentials.tls is None:
         return credentials
     folder = Path(os.path.abspath(path.parent))

@@ -29,7 +29,7 @@ from typing import Any
 
 import zenoh
 
-from evopolicy_common.errors import ConfigError, TransportError
+from evopolicy_common.errors import ConfigError, TransportError, raised_as
 from evopolicy_common.logs import structlog
 from evopolicy_common.processes.notices import notify_if_slow
 from evopolicy_common.wire import keys
@@ -201,15 +201,13 @@ class Link:
 
     def ask_blocking(self, key: str, payload: bytes, timeout_s: float) -> bytes:
         """`query` for a dedicated thread, such as the heartbeat's."""
-        try:
+        with raised_as(TransportError, f"no answer to {_verb(key)!r}", zenoh.ZError):
             replies = self._session.get(
                 key, payload=payload, timeout=timeout_s, congestion_control=zenoh.CongestionControl.BLOCK
             )
             for reply in replies:
                 if reply.ok is not None:
                     return bytes(reply.ok.payload)
-        except zenoh.ZError as error:
-            raise TransportError(f"no answer to {_verb(key)!r}: {error}") from error
         raise TransportError(f"no answer to {_verb(key)!r}; {self._doubt()}")
 
     def declare_alive(self, key: str) -> None:

@@ -28,7 +28,7 @@ from pathlib import Path
 
 import msgspec
 
-from evopolicy_common.errors import DECODE_ERRORS, ConfigError
+from evopolicy_common.errors import DECODE_ERRORS, ConfigError, raised_as
 from evopolicy_common.logs import structlog
 from evopolicy_common.records.blobs import write_atomically
 from evopolicy_common.wire import credentials, keys
@@ -191,13 +191,11 @@ def issue(
                     f"{old.identity} was issued already ({how}); --renew makes it a new folder and voids the old one"
                 )
         made = [_make(authority, one, name, hosts, now, days) for one in roles]
-        try:
+        with raised_as(ConfigError, f"cannot make folder {out}", OSError):
             out.mkdir(parents=True, mode=0o700, exist_ok=True)
             if any(out.iterdir()) and not (again and (out / "ca.pem").exists()):
                 raise ConfigError(f"{out} already contains files; name another folder with --out")
             out.chmod(0o700)
-        except OSError as error:
-            raise ConfigError(f"cannot make folder {out}: {error.strerror}") from error
         for machine, pair in made:
             listed[machine.identity] = machine
             prefix = "" if machine.role == role else f"{machine.role}-"

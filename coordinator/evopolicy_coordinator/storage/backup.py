@@ -19,7 +19,7 @@ from pathlib import Path
 
 import msgspec
 
-from evopolicy_common.errors import ConfigError, StorageError
+from evopolicy_common.errors import ConfigError, StorageError, raised_as
 from evopolicy_common.records.blobs import BlobStore, fsync_directory, write_atomically
 from evopolicy_coordinator.storage.engines import DATABASE, Place, connect, place_of
 from evopolicy_coordinator.storage.moving import copy_rows
@@ -90,18 +90,16 @@ def _copy_database(source: Place, target: Path) -> None:
         with contextlib.closing(old), contextlib.closing(new):
             copy_rows(old, new)
             return
-    try:
-        with (
-            contextlib.closing(sqlite3.connect(f"{source.absolute().as_uri()}?mode=ro", uri=True)) as reader,
-            contextlib.closing(sqlite3.connect(target, isolation_level=None)) as writer,
-        ):
-            target.chmod(0o600)
-            # In one step: a copy in several steps would restart at every write of the coordinator.
-            reader.backup(writer)
-            writer.execute("PRAGMA journal_mode=DELETE")
-            (verdict,) = writer.execute("PRAGMA integrity_check").fetchone()
-    except sqlite3.Error as error:
-        raise StorageError(f"cannot copy {source}: {error}") from error
+    with (
+        raised_as(StorageError, f"cannot copy {source}", sqlite3.Error),
+        contextlib.closing(sqlite3.connect(f"{source.absolute().as_uri()}?mode=ro", uri=True)) as reader,
+        contextlib.closing(sqlite3.connect(target, isolation_level=None)) as writer,
+    ):
+        target.chmod(0o600)
+        # In one step: a copy in several steps would restart at every write of the coordinator.
+        reader.backup(writer)
+        writer.execute("PRAGMA journal_mode=DELETE")
+        (verdict,) = writer.execute("PRAGMA integrity_check").fetchone()
     if verdict != "ok":
         raise StorageError(f"{source} is damaged: {verdict}")
     with target.open("rb") as file:

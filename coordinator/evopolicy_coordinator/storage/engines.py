@@ -22,7 +22,7 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
-from evopolicy_common.errors import ConfigError, DamagedStoreError, LeadLostError, StorageError
+from evopolicy_common.errors import ConfigError, DamagedStoreError, LeadLostError, StorageError, raised_as
 from evopolicy_common.installation import add_extra
 from evopolicy_common.records.blobs import write_atomically
 from evopolicy_common.wire.credentials import no_state
@@ -205,7 +205,7 @@ class Sqlite(Database):
     def __init__(self, path: Path, mode: Mode, timeout_s: float) -> None:
         self.place = path
         self._mode = mode
-        try:
+        with raised_as(StorageError, f"cannot open {path}", sqlite3.Error):
             self.raw = sqlite3.connect(
                 f"{path.absolute().as_uri()}?mode={mode}",
                 uri=True,
@@ -214,8 +214,6 @@ class Sqlite(Database):
                 # One thread uses a connection at a time, but another may have opened it.
                 check_same_thread=False,
             )
-        except sqlite3.Error as error:
-            raise StorageError(f"cannot open {path}: {error}") from error
         if mode == "rwc":
             path.chmod(0o600)
             try:

@@ -18,7 +18,7 @@ from pathlib import Path
 import msgspec
 from cryptography.fernet import Fernet, InvalidToken, MultiFernet
 
-from evopolicy_common.errors import DECODE_ERRORS, ConfigError, StorageError
+from evopolicy_common.errors import DECODE_ERRORS, ConfigError, StorageError, raised_as
 from evopolicy_common.records.blobs import digest_of, write_atomically
 from evopolicy_coordinator.pki.identity import SIGNING_KEY
 from evopolicy_coordinator.splits import SECRET, UNJAILED_SECRET
@@ -157,10 +157,8 @@ def _digest(data: bytes | None) -> str | None:
 
 
 def _keys(path: Path) -> MultiFernet:
-    try:
+    with raised_as(ConfigError, f"--seal-key {path}", OSError):
         mode, lines = path.stat().st_mode & 0o777, path.read_bytes().split()
-    except OSError as error:
-        raise ConfigError(f"--seal-key {path}: {error.strerror}") from error
     if mode & 0o077:
         raise ConfigError(f"--seal-key {path} may be read by others (mode {mode:04o}); run: chmod 600 {path}")
     try:

@@ -35,7 +35,7 @@ from pathlib import Path
 
 import msgspec
 
-from evopolicy_common.errors import DECODE_ERRORS, ConfigError
+from evopolicy_common.errors import DECODE_ERRORS, ConfigError, raised_as
 from evopolicy_common.processes.preflight import check_writable, refused
 from evopolicy_common.records.blobs import write_atomically
 from evopolicy_common.records.open_run import is_held
@@ -323,13 +323,11 @@ def resolve_listen(endpoints: list[str]) -> tuple[str, ...]:
 
 def _free_port(endpoint: str, host: str) -> int:
     bare = host.strip("[]")
-    try:
+    with raised_as(ConfigError, f"--listen {endpoint!r}", OSError):
         family, kind, _, _, address = socket.getaddrinfo(bare, 0, type=socket.SOCK_STREAM)[0]
         with socket.socket(family, kind) as probe:
             probe.bind(address)
             return int(probe.getsockname()[1])
-    except OSError as error:
-        raise ConfigError(f"--listen {endpoint!r}: {error.strerror or error}") from error
 
 
 def reachable(endpoints: tuple[str, ...]) -> tuple[str, ...]:

@@ -17,7 +17,7 @@ import typer
 from evopolicy_common.cli.conventions import Json, code_of, fail
 from evopolicy_common.cli.frame import App
 from evopolicy_common.console import progress_bars, terminal
-from evopolicy_common.errors import ConfigError
+from evopolicy_common.errors import ConfigError, raised_as
 from evopolicy_common.processes.preflight import check_writable
 from evopolicy_common.records.rescores import is_name
 from evopolicy_common.regular_files import read_given
@@ -114,10 +114,8 @@ def _score_table(paths: list[Path]) -> ScoreTable | None:
     if len(paths) > 1:
         raise ConfigError(f"one CSV of held-out returns at most, not {len(paths)}")
     for path in paths:
-        try:
+        with raised_as(ConfigError, f"{path} cannot be read", UnicodeDecodeError):
             return read_score_csv(read_given(path, str(path)).decode(), source=str(path))
-        except UnicodeDecodeError as error:
-            raise ConfigError(f"{path} cannot be read: {error}") from error
     return None
 
 

@@ -26,7 +26,7 @@ import msgspec
 from cryptography.exceptions import InvalidSignature
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
 
-from evopolicy_common.errors import DECODE_ERRORS, ProtocolError
+from evopolicy_common.errors import DECODE_ERRORS, ProtocolError, raised_as
 from evopolicy_common.messages.bounds import Int, Many, Number, Word
 from evopolicy_common.messages.environment import Split
 from evopolicy_common.messages.operator import RunResult
@@ -162,10 +162,8 @@ _recordings = msgspec.msgpack.Decoder(list[bytes | None])
 
 def unpack_recordings(data: bytes) -> list[bytes | None]:
     """ProtocolError for bytes that `pack_recordings` did not make."""
-    try:
+    with raised_as(ProtocolError, "not a group's recordings", *DECODE_ERRORS):
         return _recordings.decode(data)
-    except DECODE_ERRORS as error:
-        raise ProtocolError(f"not a group's recordings: {error}") from error
 
 
 class Listed(msgspec.Struct, frozen=True, kw_only=True):

@@ -15,7 +15,7 @@ from typing import Any, Literal
 import msgspec
 
 from evopolicy_common.catalogue.installs import Licence
-from evopolicy_common.errors import DECODE_ERRORS, ProtocolError
+from evopolicy_common.errors import DECODE_ERRORS, ProtocolError, raised_as
 from evopolicy_results.publish import contents
 
 Cover = Literal["derived", "committed", "told", "removed", "replayed", "claim"]
@@ -96,10 +96,8 @@ _FILES = {file: re.compile(re.escape(file).replace(r"\*", "[^/]+")) for file in 
 def parsed(name: str, data: bytes) -> Any:
     """The content of a JSON file of published results. Raises ProtocolError where publication would have spelt it in
     another way."""
-    try:
+    with raised_as(ProtocolError, f"{name} is damaged", *DECODE_ERRORS, ValueError):
         value = msgspec.json.decode(data)
-    except (*DECODE_ERRORS, ValueError) as error:
-        raise ProtocolError(f"{name} is damaged: {error}") from error
     if name.endswith(f"/{contents.RUN}"):
         spelt = msgspec.json.format(msgspec.json.encode(value), indent=2) + b"\n"
     else:

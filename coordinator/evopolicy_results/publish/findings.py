@@ -8,7 +8,7 @@ from typing import Any, Literal, NamedTuple, Protocol, TypeVar
 
 import msgspec
 
-from evopolicy_common.errors import DECODE_ERRORS, BundleError, ProtocolError
+from evopolicy_common.errors import DECODE_ERRORS, BundleError, ProtocolError, raised_as
 from evopolicy_common.messages.environment import Split
 from evopolicy_common.messages.operator import RunResult
 from evopolicy_common.records import journal
@@ -205,8 +205,6 @@ class History(NamedTuple):
 
 
 def decoded(name: str, data: bytes, kind: Callable[..., T] | type[T]) -> T:
-    try:
+    with raised_as(ProtocolError, f"{name} is damaged", *DECODE_ERRORS, ValueError):
         content: T = msgspec.json.decode(data, type=kind)
-    except (*DECODE_ERRORS, ValueError) as error:
-        raise ProtocolError(f"{name} is damaged: {error}") from error
     return content

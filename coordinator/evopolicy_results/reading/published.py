@@ -15,7 +15,7 @@ from typing import Any
 import msgspec
 
 from evopolicy_common import catalogue
-from evopolicy_common.errors import DECODE_ERRORS, ProtocolError
+from evopolicy_common.errors import DECODE_ERRORS, ProtocolError, raised_as
 from evopolicy_common.messages.run_settings import HIDDEN_COUNTS
 from evopolicy_common.records.code_metrics import PUBLISHED_SCHEMA
 from evopolicy_common.records.policies.checkpoints import read_meta
@@ -68,10 +68,8 @@ def read_summary(path: Path) -> PublishedSummary | None:
 def read_record(folder: Path, data: bytes) -> RunRecord | None:
     """Converts the bytes of a `run.json` of the published software to our record; None for one of ours. Raises
     ProtocolError when it is damaged, or no JSON, which has no NaN, half characters or numbers beyond floats."""
-    try:
+    with raised_as(ProtocolError, "not a run record", *DECODE_ERRORS):
         record = msgspec.json.decode(data)
-    except DECODE_ERRORS as error:
-        raise ProtocolError(f"not a run record: {error}") from error
     ours = not isinstance(record, dict) or "record_version" in record
     if ours or record.get("schema_version") != PUBLISHED_SCHEMA:
         return None
@@ -81,7 +79,7 @@ def read_record(folder: Path, data: bytes) -> RunRecord | None:
     summaries = list(filter(None, map(read_summary, sorted(feedback.glob("submit_*/summary.json")))))
     model, env = _names(folder, record, summaries)
     heldout = outcome.get("heldout_returns") or ()
-    try:
+    with raised_as(ProtocolError, "not a published run record", msgspec.ValidationError, TypeError):
         has_published_cases = len(heldout) == HIDDEN_COUNTS["published-data"][1]
         return RunRecord(
             record_version=PUBLISHED,
@@ -128,8 +126,6 @@ def read_record(folder: Path, data: bytes) -> RunRecord | None:
                 Versions,
             ),
         )
-    except (msgspec.ValidationError, TypeError) as error:
-        raise ProtocolError(f"not a published run record: {error}") from error
 
 
 def _object(fields: dict[str, object], name: str) -> dict[str, Any]:

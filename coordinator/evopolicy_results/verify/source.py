@@ -11,7 +11,7 @@ from pathlib import Path
 
 import msgspec
 
-from evopolicy_common.errors import ConfigError, ProtocolError
+from evopolicy_common.errors import ConfigError, ProtocolError, raised_as
 from evopolicy_common.messages.environment import Split
 from evopolicy_common.records.policies.submits import SubmitFiles, read_submits
 from evopolicy_common.records.run_files import RUN_JSON, read_record
@@ -65,12 +65,10 @@ def read_run(root: Path) -> RunUnderTest:
         ) from error
     except ProtocolError as error:
         raise ConfigError(f"{root / RUN_JSON}: {error}") from error
-    try:
+    with raised_as(ConfigError, root, ProtocolError):
         submits = read_submits(root)
         for submit in submits:  # a damaged file is an error before anything is played
             _ = submit.summary, submit.meta
-    except ProtocolError as error:
-        raise ConfigError(f"{root}: {error}") from error
     train = tuple(played for submit in submits if (played := _train(record, submit)))
     hidden = tuple(_hidden(record, {one.submit_index: one for one in train}))
     return RunUnderTest(root=root, record=record, submits=tuple(submits), train=train, hidden=hidden)

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import msgspec
 
-from evopolicy_common.errors import ConfigError, SandboxError
+from evopolicy_common.errors import ConfigError, SandboxError, raised_as
 from evopolicy_common.messages.episode import Tier
 from evopolicy_common.processes import distribution
 from evopolicy_common.processes.packages import check_alone, files_of, modules_of
@@ -171,12 +171,10 @@ def _python_files(allowed_packages: tuple[str, ...]) -> _PythonFiles:
     else:
         # A separate prefix (pyenv, conda, uv, /usr/local) also has shared libraries beside the standard library.
         read.append(f"{prefix}/lib")
-    try:
+    with raised_as(SandboxError, "packages that policies may import", ConfigError):
         packages = files_of(allowed_packages)
         if more := [name for name in allowed_packages if name != "numpy"]:
             check_alone(more)
-    except ConfigError as error:
-        raise SandboxError(f"packages that policies may import: {error}") from error
     # The C library, its loader and the system's shared libraries.
     libraries = ["/lib64", "/etc/ld.so.cache", "/lib", "/usr/lib64", "/usr/lib"]
     triplet = sysconfig.get_config_var("MULTIARCH")

@@ -18,7 +18,7 @@ from urllib.parse import urlsplit
 import msgspec
 from msgspec import Meta
 
-from evopolicy_common.errors import DECODE_ERRORS, ConfigError
+from evopolicy_common.errors import DECODE_ERRORS, ConfigError, raised_as
 from evopolicy_common.regular_files import read_given
 from evopolicy_gateway.inputs.declared import McpServer
 from evopolicy_gateway.relay.apis import Protocol, Upstream
@@ -364,9 +364,7 @@ def _is_reachable(url: str, *, insecure_http: bool = False) -> bool:
 def read_agent(path: Path) -> AgentConfig:
     """The settings in a TOML file. Raises ConfigError with the file and the fault."""
     data = read_given(path, str(path))
-    try:
+    with raised_as(ConfigError, path, ConfigError, *DECODE_ERRORS):
         config = msgspec.toml.decode(data, type=AgentConfig)
         config.check()
-    except (ConfigError, *DECODE_ERRORS) as error:
-        raise ConfigError(f"{path}: {error}") from error
     return config

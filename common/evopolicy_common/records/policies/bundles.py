@@ -17,7 +17,7 @@ from typing import BinaryIO
 
 import msgspec
 
-from evopolicy_common.errors import DECODE_ERRORS, BundleError
+from evopolicy_common.errors import DECODE_ERRORS, BundleError, raised_as
 from evopolicy_common.records.blobs import digest_of
 from evopolicy_common.regular_files import open_regular
 
@@ -62,10 +62,8 @@ def snapshot(folder: Path, leave_out: Collection[str] = ()) -> Bundle:
     Raises BundleError with the path, the value and the limit for links, devices, sockets, file names that are not
     portable, and exceeded limits. Nothing outside `folder` is read, even if `folder` changes meanwhile.
     """
-    try:
+    with raised_as(BundleError, f"{folder.name}/ is not a folder that can be read", OSError):
         root = os.open(folder, FOLDER)
-    except OSError as error:
-        raise BundleError(f"{folder.name}/ is not a folder that can be read: {error.strerror}") from error
     files: list[BundleFile] = []
     free = MAX_BYTES
     try:
@@ -164,10 +162,8 @@ def load(packed: bytes, digest: str) -> Bundle:
     """The bundle in `packed`. Raises BundleError when it is damaged, too large, or does not match `digest`."""
     if digest_of(packed) != digest:
         raise BundleError(f"bundle is not {digest}")
-    try:
+    with raised_as(BundleError, "not a bundle", *DECODE_ERRORS):
         files = _files_decoder.decode(packed)
-    except DECODE_ERRORS as error:
-        raise BundleError(f"not a bundle: {error}") from error
     _check(files)
     return Bundle(digest, packed, files)
 

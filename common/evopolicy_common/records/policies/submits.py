@@ -11,7 +11,7 @@ from functools import cached_property
 from pathlib import Path
 
 from evopolicy_common.confined import Confined, Name
-from evopolicy_common.errors import ProtocolError
+from evopolicy_common.errors import ProtocolError, raised_as
 from evopolicy_common.records.policies.checkpoints import CheckpointMeta, read_meta
 from evopolicy_common.records.run_record import Artifacts
 from evopolicy_common.records.summary import Summary, decode_summary
@@ -47,10 +47,8 @@ class SubmitFiles:
     @cached_property
     def meta(self) -> CheckpointMeta | None:
         """The checkpoint's metadata; None without any. Raises ProtocolError when they cannot be read."""
-        try:
+        with raised_as(ProtocolError, self.checkpoint.relative_to(self._run.root), ProtocolError):
             return read_meta(self.checkpoint)
-        except ProtocolError as error:
-            raise ProtocolError(f"{self.checkpoint.relative_to(self._run.root)}: {error}") from error
 
     @property
     def status(self) -> str:
