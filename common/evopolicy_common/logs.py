@@ -17,4 +17,7 @@ else:
     finally:
         del sys.modules["rich"]
 
-__all__ = ["structlog"]
+__all__ = ["log", "structlog"]
+
+log: structlog.stdlib.BoundLogger = structlog.get_logger()
+"""The logger of all modules; `setup_logging` decides what becomes of its lines."""

@@ -34,7 +34,7 @@ from evopolicy_common.errors import (
     StorageError,
     WorkerError,
 )
-from evopolicy_common.logs import structlog
+from evopolicy_common.logs import log
 from evopolicy_common.messages import bounds
 from evopolicy_common.messages.environment import EnvironmentDescription
 from evopolicy_common.messages.episode import Tier
@@ -42,8 +42,6 @@ from evopolicy_common.messages.worker import REASON_CHARACTERS
 from evopolicy_common.records.blobs import write_atomically
 from evopolicy_worker.environments import registry
 from evopolicy_worker.slots.slot import Slot
-
-log: structlog.stdlib.BoundLogger = structlog.get_logger()
 
 RETRY_PAUSE_S, LONGEST_RETRY_PAUSE_S = 30.0, 600.0
 """Pause before what does not work is tried again; it doubles each time."""

@@ -25,7 +25,7 @@ from evopolicy_common.cli.conventions import fail, fail_on_our_errors, setup_log
 from evopolicy_common.cli.frame import App, Version, run_app
 from evopolicy_common.console import filled_table, terminal
 from evopolicy_common.errors import ConfigError, MachineError, SandboxError
-from evopolicy_common.logs import structlog
+from evopolicy_common.logs import log
 from evopolicy_common.messages.environment import EnvironmentDescription
 from evopolicy_common.messages.episode import Tier
 from evopolicy_common.processes import distribution, proc
@@ -45,7 +45,6 @@ from evopolicy_worker.slots.slot import SANDBOXED, Slot, available_tiers, try_ou
 from evopolicy_worker.supervisor import MAX_PREPARED, Options, Supervisor
 
 app = App()
-log: structlog.stdlib.BoundLogger = structlog.get_logger()
 
 
 @app.callback(invoke_without_command=True)

@@ -9,12 +9,10 @@ import time
 from collections.abc import Callable
 
 from evopolicy_common.errors import ProtocolError, TransportError
-from evopolicy_common.logs import structlog
+from evopolicy_common.logs import log
 from evopolicy_common.messages.worker import Heartbeat, HeartbeatReply, HeldLease, Refused
 from evopolicy_common.wire import codec, keys
 from evopolicy_common.wire.transport import Link
-
-log: structlog.stdlib.BoundLogger = structlog.get_logger()
 
 ANSWERED_PAUSE_S = 0.02
 """Minimum time between heartbeats. The coordinator repeats a cancellation, without delay, in each reply until the job

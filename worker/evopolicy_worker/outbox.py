@@ -21,7 +21,7 @@ from collections.abc import Awaitable, Callable
 import msgspec
 
 from evopolicy_common.errors import ProtocolError, RefusedError
-from evopolicy_common.logs import structlog
+from evopolicy_common.logs import log
 from evopolicy_common.messages.episode import BlobRef
 from evopolicy_common.messages.worker import (
     REASON_CHARACTERS,
@@ -34,8 +34,6 @@ from evopolicy_common.records.blobs import digest_of
 from evopolicy_common.refusals import NOT_NOW, Refusal
 from evopolicy_common.wire import codec
 from evopolicy_common.wire.requests import Requester
-
-log: structlog.stdlib.BoundLogger = structlog.get_logger()
 
 MAX_RESULTS = 256
 """Waiting results at which the worker stops leasing jobs, so that memory stays bounded while the coordinator is

@@ -33,7 +33,7 @@ from evopolicy_common.errors import (
     RefusedError,
     TransportError,
 )
-from evopolicy_common.logs import structlog
+from evopolicy_common.logs import log
 from evopolicy_common.messages.episode import BlobRef, EpisodeOutcome, Job, Tier
 from evopolicy_common.messages.worker import (
     REASON_CHARACTERS,
@@ -61,8 +61,6 @@ from evopolicy_worker.heartbeat import HeartbeatThread
 from evopolicy_worker.outbox import Outbox
 from evopolicy_worker.slot_protocol.begun import HandedBack
 from evopolicy_worker.slots.slot import Slot
-
-log: structlog.stdlib.BoundLogger = structlog.get_logger()
 
 LEASE_POLL_S = 10.0
 RESTART_PAUSE_S = 1.0

@@ -19,7 +19,7 @@ import msgspec
 
 from evopolicy_common.cli.conventions import setup_logging
 from evopolicy_common.errors import ConfigError, EvopolicyError
-from evopolicy_common.logs import structlog
+from evopolicy_common.logs import log
 from evopolicy_common.records.secrets import Redaction, is_secret, note_passed, without_keys
 from evopolicy_gateway.harnesses import config_of, make
 from evopolicy_gateway.harnesses.interface.agent_config import AgentConfig
@@ -43,8 +43,6 @@ _TEXT_SHOWN = 2000
 _LINES_SHOWN = 8
 _TELL_TIME_S = 5.0
 _SURVIVORS_PAUSE_S = 1.0
-
-log: structlog.stdlib.BoundLogger = structlog.get_logger()
 
 
 async def keep(order: StartAgent, orders: Orders) -> AgentEnded:

@@ -17,7 +17,7 @@ from typing import Any
 
 from evopolicy_common.cli.conventions import FAILURE, code_of, setup_logging
 from evopolicy_common.errors import ConfigError
-from evopolicy_common.logs import structlog
+from evopolicy_common.logs import log
 from evopolicy_common.processes.preflight import foreseen
 from evopolicy_gateway.processes import child_messages
 from evopolicy_gateway.processes.child_messages import Orders, Progress, Ready, Waits
@@ -26,8 +26,6 @@ from evopolicy_gateway.run_folder.layout import RunFolder, folder_of
 from evopolicy_gateway.submits.pipeline import SubmitPipeline
 from evopolicy_gateway.submits.tickets import TicketMachine
 from evopolicy_gateway.workspace.agents_md import Urls
-
-log: structlog.stdlib.BoundLogger = structlog.get_logger()
 
 
 @contextlib.contextmanager

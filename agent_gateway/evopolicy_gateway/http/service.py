@@ -28,7 +28,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from evopolicy_common import published_forms
 from evopolicy_common.errors import RequestError
-from evopolicy_common.logs import structlog
+from evopolicy_common.logs import log
 from evopolicy_common.messages.gateway import CANCELLED, RunState
 from evopolicy_common.records.run_record import PROTOCOL_VERSION
 from evopolicy_gateway.http.task import task_markdown
@@ -36,8 +36,6 @@ from evopolicy_gateway.submits.pipeline import SubmitPipeline
 from evopolicy_gateway.submits.submit_request import MAX_BODY_BYTES, refuse_size
 from evopolicy_gateway.submits.tickets import RUN_CLOSED, ConflictError, Ticket, TicketMachine
 from evopolicy_gateway.workspace.agents_md import LAST_WORDS_S
-
-log: structlog.stdlib.BoundLogger = structlog.get_logger()
 
 BODY_WAIT_S = 30.0
 """A body must arrive within this time, seconds."""

@@ -12,7 +12,7 @@ import socket
 from collections.abc import Mapping
 from functools import partial
 
-from evopolicy_common.logs import structlog
+from evopolicy_common.logs import log
 from evopolicy_gateway.jail.settings import Host
 
 PROXY_PORT = 3128
@@ -24,8 +24,6 @@ _MAX_HEAD_BYTES = 16 << 10
 _HEAD_TIMEOUT_S = 30.0
 _CONNECT_TIMEOUT_S = 60.0
 _CHUNK = 64 << 10
-
-log: structlog.stdlib.BoundLogger = structlog.get_logger()
 
 
 class JailProxy:

@@ -22,7 +22,7 @@ from collections.abc import Callable
 from typing import Any
 
 from evopolicy_common.errors import ConfigError, RefusedError
-from evopolicy_common.logs import structlog
+from evopolicy_common.logs import log
 from evopolicy_common.refusals import RUN_OVER
 from evopolicy_common.wire import credentials, transport
 from evopolicy_common.wire.http import serving
@@ -38,8 +38,6 @@ from evopolicy_gateway.workspace import staging as workspace
 from evopolicy_gateway.workspace.agents_md import Urls
 
 _POLL_S = 1.0
-
-log: structlog.stdlib.BoundLogger = structlog.get_logger()
 
 
 class Gateway:

@@ -10,7 +10,7 @@ from typing import Any
 import msgspec
 
 from evopolicy_common.errors import ConfigError, EvopolicyError, RefusedError
-from evopolicy_common.logs import structlog
+from evopolicy_common.logs import log
 from evopolicy_common.messages import operator as messages
 from evopolicy_common.messages.episode import EpisodeOutcome
 from evopolicy_common.processes.notices import notify_if_slow
@@ -22,8 +22,6 @@ from evopolicy_common.wire.operator_client import TIMEOUT_S, WAIT_S, OperatorCli
 from evopolicy_common.wire.transport import Link
 from evopolicy_gateway.run_folder.layout import RunFolder, saved
 from evopolicy_gateway.run_folder.locks import until_free
-
-log: structlog.stdlib.BoundLogger = structlog.get_logger()
 
 _AWAY = (Refusal.UNAVAILABLE,)
 

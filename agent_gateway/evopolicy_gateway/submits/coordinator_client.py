@@ -18,7 +18,7 @@ from typing import Any, TypeVar, cast
 import msgspec
 
 from evopolicy_common.errors import RefusedError, TransportError
-from evopolicy_common.logs import structlog
+from evopolicy_common.logs import log
 from evopolicy_common.messages import gateway as messages
 from evopolicy_common.messages.episode import BlobRef
 from evopolicy_common.messages.worker import Message
@@ -41,8 +41,6 @@ _PAST_ALL = (1 << 31) - 1
 """A cursor beyond all results."""
 LARGE_BYTES = 16 << 20
 """A larger recording is kept in a file."""
-
-log: structlog.stdlib.BoundLogger = structlog.get_logger()
 
 
 Wanted = TypeVar("Wanted")

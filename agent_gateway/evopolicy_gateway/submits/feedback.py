@@ -24,7 +24,7 @@ from typing import Any
 import msgspec
 
 from evopolicy_common.errors import ProtocolError, RefusedError
-from evopolicy_common.logs import structlog
+from evopolicy_common.logs import log
 from evopolicy_common.messages.episode import BlobRef
 from evopolicy_common.messages.gateway import EpisodeFeedback, ResultsPage, SubmitAccepted, SubmitDone
 from evopolicy_common.processes.left_files import left_files
@@ -44,8 +44,6 @@ from evopolicy_gateway.submits.episode_files import (
     takes_much,
 )
 from evopolicy_gateway.submits.tickets import MAX_DEATHS, Ticket, TicketMachine
-
-log: structlog.stdlib.BoundLogger = structlog.get_logger()
 
 SUMMARY = "summary.json"
 FIRST_LINGER_S = 0.02

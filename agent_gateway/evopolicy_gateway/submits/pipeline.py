@@ -18,7 +18,7 @@ from functools import partial
 from typing import TypeVar
 
 from evopolicy_common.errors import RefusedError, RequestError, StorageError
-from evopolicy_common.logs import structlog
+from evopolicy_common.logs import log
 from evopolicy_common.messages.gateway import RunOpened, Submit, SubmitAccepted, SubmitDone
 from evopolicy_common.records.blobs import BlobStore
 from evopolicy_common.records.open_run import AnyLine, Died, Requested, Settled
@@ -40,7 +40,6 @@ from evopolicy_gateway.submits.tickets import (
     TicketMachine,
 )
 
-log: structlog.stdlib.BoundLogger = structlog.get_logger()
 T = TypeVar("T")
 
 DISK_PAUSE_S = 2.0

@@ -9,15 +9,13 @@ from pathlib import Path
 import msgspec
 
 from evopolicy_common.errors import BundleError
-from evopolicy_common.logs import structlog
+from evopolicy_common.logs import log
 from evopolicy_common.messages.episode import FailureCategory, PolicyFailure
 from evopolicy_common.records.blobs import BlobStore
 from evopolicy_common.records.code_metrics import MAX_PARSED_BYTES, parse
 from evopolicy_common.records.policies import bundles
 from evopolicy_common.records.policies.trees import Recorder
 from evopolicy_common.records.secrets import read_passed
-
-log: structlog.stdlib.BoundLogger = structlog.get_logger()
 
 POLICY_FILE = "policy.py"
 

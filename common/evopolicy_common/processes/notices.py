@@ -7,9 +7,7 @@ import contextlib
 import os
 from collections.abc import Iterator
 
-from evopolicy_common.logs import structlog
-
-log: structlog.stdlib.BoundLogger = structlog.get_logger()
+from evopolicy_common.logs import log
 
 AFTER_S = 3.0
 MANY_SLOTS = 8

@@ -21,7 +21,7 @@ from urllib.parse import urlsplit
 import msgspec
 
 from evopolicy_common.errors import ProtocolError, RefusedError, TransportError
-from evopolicy_common.logs import structlog
+from evopolicy_common.logs import log
 from evopolicy_common.messages.episode import BlobRef
 from evopolicy_common.messages.operator import OperatorReply
 from evopolicy_common.messages.worker import BlobAck, BlobChunk, BlobGet, BlobPut, Message, Refused
@@ -32,8 +32,6 @@ from evopolicy_common.wire.transport import Link
 
 Reply = TypeVar("Reply")
 Wanted = TypeVar("Wanted")
-
-log: structlog.stdlib.BoundLogger = structlog.get_logger()
 
 FIRST_PAUSE_S = 0.05
 LONGEST_PAUSE_S = 0.5

@@ -30,12 +30,10 @@ from typing import Any
 import zenoh
 
 from evopolicy_common.errors import ConfigError, TransportError, raised_as
-from evopolicy_common.logs import structlog
+from evopolicy_common.logs import log
 from evopolicy_common.processes.notices import notify_if_slow
 from evopolicy_common.wire import keys
 from evopolicy_common.wire.credentials import Credentials, MachineRole, TlsFiles, check_endpoints
-
-log: structlog.stdlib.BoundLogger = structlog.get_logger()
 
 MAX_MESSAGE_BYTES = 16 << 20
 _REPLY_LANES = 8

@@ -29,13 +29,11 @@ from pathlib import Path
 import msgspec
 
 from evopolicy_common.errors import DECODE_ERRORS, ConfigError, raised_as
-from evopolicy_common.logs import structlog
+from evopolicy_common.logs import log
 from evopolicy_common.records.blobs import write_atomically
 from evopolicy_common.wire import credentials, keys
 from evopolicy_common.wire.credentials import Credentials, MachineRole, Role, TlsFiles
 from evopolicy_coordinator.pki import certs
-
-log: structlog.stdlib.BoundLogger = structlog.get_logger()
 
 BESIDE: dict[MachineRole, tuple[Role, ...]] = {"operator": ("gateway",)}
 """Roles issued in the same folder: an operator's machine starts gateways, which get rights of their own."""

@@ -19,7 +19,7 @@ from collections.abc import Callable
 from math import inf
 
 from evopolicy_common.errors import DamagedStoreError, LeadLostError, PartFailedError, StorageError
-from evopolicy_common.logs import structlog
+from evopolicy_common.logs import log
 from evopolicy_coordinator.core.contract.effects import Effect
 from evopolicy_coordinator.core.contract.events import AnyEvent
 from evopolicy_coordinator.core.contract.records import latest_time
@@ -28,8 +28,6 @@ from evopolicy_coordinator.core.machine import Core
 from evopolicy_coordinator.storage.sealing import SharedFiles
 from evopolicy_coordinator.storage.store import Store
 from evopolicy_coordinator.storage.writer import Outbox, Writer
-
-log: structlog.stdlib.BoundLogger = structlog.get_logger()
 
 _FIRST_PAUSE_S = 0.2
 _LONGEST_PAUSE_S = 5.0

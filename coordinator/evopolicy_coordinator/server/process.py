@@ -18,7 +18,7 @@ import msgspec
 
 from evopolicy_common import catalogue
 from evopolicy_common.errors import ConfigError, DamagedStoreError, LeadLostError, StorageError
-from evopolicy_common.logs import structlog
+from evopolicy_common.logs import log
 from evopolicy_common.processes.packages import SIMULATORS
 from evopolicy_common.wire import credentials, transport
 from evopolicy_common.wire.credentials import Ready
@@ -54,8 +54,6 @@ from evopolicy_coordinator.storage.state_folder import (
 )
 from evopolicy_coordinator.storage.store import Store
 from evopolicy_coordinator.worlds import JOURNAL
-
-log: structlog.stdlib.BoundLogger = structlog.get_logger()
 
 _JOINED = "another command's local cluster runs on this state folder: both share it and the slots of both"
 _PAUSE_S = 0.1

@@ -24,7 +24,7 @@ from evopolicy_common.errors import (
     RefusedError,
     StorageError,
 )
-from evopolicy_common.logs import structlog
+from evopolicy_common.logs import log
 from evopolicy_common.messages.episode import BlobRef, EpisodeOutcome
 from evopolicy_common.messages.gateway import EpisodeFeedback, ResultsPage
 from evopolicy_common.messages.operator import (
@@ -62,8 +62,6 @@ from evopolicy_coordinator.server.request_checks import MAX_COUNT, finite_cursor
 from evopolicy_coordinator.server.uploads import Uploads
 from evopolicy_coordinator.storage.engines import Place
 from evopolicy_coordinator.storage.store import Reader
-
-log: structlog.stdlib.BoundLogger = structlog.get_logger()
 
 MAX_PAGE_BYTES = 1 << 20
 _READERS = 2

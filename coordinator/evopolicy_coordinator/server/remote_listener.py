@@ -16,12 +16,10 @@ import contextlib
 from collections.abc import AsyncIterator, Callable
 
 from evopolicy_common.errors import ConfigError, TransportError
-from evopolicy_common.logs import structlog
+from evopolicy_common.logs import log
 from evopolicy_common.wire import keys, transport
 from evopolicy_common.wire.transport import IncomingQuery, Server
 from evopolicy_coordinator.pki.machines import Machines
-
-log: structlog.stdlib.BoundLogger = structlog.get_logger()
 
 CHECK_S = 0.5
 """Interval between checks for issued or revoked machines."""

@@ -32,7 +32,7 @@ from evopolicy_common.errors import (
     RefusedError,
     StorageError,
 )
-from evopolicy_common.logs import structlog
+from evopolicy_common.logs import log
 from evopolicy_common.messages import operator
 from evopolicy_common.messages.status import DiskUse, StatusReply, StatusRequest, folded
 from evopolicy_common.messages.worker import BlobGet, BlobPut, LeaseRequest, Message, Refused
@@ -57,8 +57,6 @@ from evopolicy_coordinator.server.request_parser import Parsed, RequestParser
 from evopolicy_coordinator.storage.disk_use import sizes
 from evopolicy_coordinator.storage.store import Store
 from evopolicy_coordinator.storage.writer import Writer
-
-log: structlog.stdlib.BoundLogger = structlog.get_logger()
 
 MAX_BUNDLE_BYTES = bundles.MAX_BYTES + bundles.MAX_FILES * (bundles.MAX_PATH_BYTES + 32)
 _FORGET_S = 120.0

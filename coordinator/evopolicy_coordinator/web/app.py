@@ -29,7 +29,7 @@ from starlette.types import ASGIApp
 
 from evopolicy_common.confined import Confined, NotThereError
 from evopolicy_common.errors import ConfigError
-from evopolicy_common.logs import structlog
+from evopolicy_common.logs import log
 from evopolicy_common.messages.status import StatusReply
 from evopolicy_common.wire.credentials import Credentials
 from evopolicy_common.wire.http import bound, serving
@@ -65,8 +65,6 @@ _REPORT_TYPES = {
     **IMAGES,
 }
 _NOT_THERE = 404, "Not found", "Nothing is at this address, or its run is gone."
-
-log: structlog.stdlib.BoundLogger = structlog.get_logger()
 
 
 class PageError(Exception):

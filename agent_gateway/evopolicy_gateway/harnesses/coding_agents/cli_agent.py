@@ -22,7 +22,7 @@ from typing import Any, Literal
 import msgspec
 
 from evopolicy_common.errors import ConfigError, EvopolicyError
-from evopolicy_common.logs import structlog
+from evopolicy_common.logs import log
 from evopolicy_gateway.harnesses.coding_agents import session
 from evopolicy_gateway.harnesses.coding_agents.dialect import Dialect, TurnReader, first_line
 from evopolicy_gateway.harnesses.coding_agents.session import SessionState
@@ -41,8 +41,6 @@ _PROBE_TIMEOUT_S = 60.0
 _MAX_PAUSE_S = 3600.0
 _IN_FLIGHT_PAUSE_S = 0.5
 _MAX_FAULTY = 2
-
-log: structlog.stdlib.BoundLogger = structlog.get_logger()
 
 
 class CliAgent(Harness):

@@ -13,7 +13,7 @@ import time
 from collections import OrderedDict
 
 from evopolicy_common.errors import EvopolicyError
-from evopolicy_common.logs import structlog
+from evopolicy_common.logs import log
 from evopolicy_common.messages.status import RetriedJobs, StatusReply
 from evopolicy_common.wire import transport
 from evopolicy_common.wire.credentials import Credentials
@@ -27,8 +27,6 @@ _RETRIES_OF_A_RUN = 100
 _RETRIED_RUNS = 1000
 STALE_S = 90.0
 """Age in seconds after which the last reply is no longer used."""
-
-log: structlog.stdlib.BoundLogger = structlog.get_logger()
 
 
 class Cluster:
