@@ -128,9 +128,7 @@ class RemoteHarness(Harness):
 class _Talk:
     def __init__(self, process: AgentProcess, stage: Stage) -> None:
         self.turn = 0
-        """Number of turns answered."""
         self.stopped = False
-        """Whether it has sent stop."""
         self._process = process
         self._stage = stage
         self._answered = asyncio.Event()

@@ -238,7 +238,6 @@ class _Exchange:
         self._send = send
         self._refused = False
         self.answered = False
-        """Whether the answer has started."""
         # A client that waits for "100 Continue" sends no body to a refusal.
         self._unread = (b"expect", b"100-continue") not in scope["headers"]
 

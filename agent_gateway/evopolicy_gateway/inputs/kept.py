@@ -27,7 +27,6 @@ class Kept(msgspec.Struct, frozen=True, kw_only=True):
 
     folder: Path | None = None
     skills: tuple[str, ...] = ()
-    """Names of skills."""
     servers: Mapping[str, Server] = {}
 
     def __bool__(self) -> bool:

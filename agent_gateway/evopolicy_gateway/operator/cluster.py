@@ -63,9 +63,7 @@ class Cluster(msgspec.Struct, frozen=True, kw_only=True):
 class Reached(NamedTuple):
     operations: Operations
     gateway: Credentials
-    """Credentials of the gateway role."""
     local: LocalCluster | None
-    """The local cluster that was started here."""
 
 
 @contextlib.asynccontextmanager

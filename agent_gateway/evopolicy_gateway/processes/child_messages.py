@@ -79,7 +79,6 @@ class Progress(Event, frozen=True, kw_only=True, tag="progress"):
     spent: bool = False
     """No further submit is possible, and none runs."""
     cancelled: bool = False
-    """The operator has cancelled the run."""
 
 
 class AgentTurn(Event, frozen=True, kw_only=True, tag="turn"):
@@ -94,7 +93,6 @@ class AgentDoing(Event, frozen=True, kw_only=True, tag="doing"):
     tokens: dict[str, Any] | None = None
     """Of the run so far, as in `run.json`."""
     note: str = ""
-    """Note for the operator."""
     paused_s: float = 0.0
     """Seconds that it waits for `provider`; 0.0 when it does not wait, or no longer."""
     provider: str = ""
@@ -173,7 +171,6 @@ class StartAgent(Order, frozen=True, kw_only=True, tag="start_agent"):
     silence_s: float | None = None
     """A program without activity for this long is ended, seconds; None: no such limit."""
     jail: JailOrder | None = None
-    """None: not jailed."""
     limits: AgentLimits = AgentLimits()
 
 

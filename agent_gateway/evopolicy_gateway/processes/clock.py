@@ -76,7 +76,6 @@ class Activity:
         """Inactive after `limit_s` seconds; `cpu_s` returns the processor seconds used by the agent's processes."""
         self.limit_s = limit_s
         self.submits = 0
-        """Number of submits that it has requested."""
         self._workspace = workspace
         self._cpu_s = cpu_s
         self._running = False

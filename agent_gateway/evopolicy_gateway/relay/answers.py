@@ -57,7 +57,6 @@ class AnswerReader:
         self._drops_usage = drops_usage
         self._held = bytearray()
         self._counts: dict[str, int] = {}
-        """By path."""
         self._wrong: set[str] = set()
         self._chars = 0
         self._model = self._tier = ""

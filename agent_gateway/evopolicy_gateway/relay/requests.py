@@ -82,7 +82,6 @@ class Facts(msgspec.Struct, frozen=True, kw_only=True):
     with_counts: bytes | None = None
     """The body that also asks for counts, where the request is for a stream that would have none."""
     asked: str = ""
-    """The model."""
     hosted: tuple[str, ...] = ()
     """Kinds of tools that the provider runs."""
     unknown: str = ""

@@ -125,7 +125,6 @@ class Plan(msgspec.Struct, frozen=True, kw_only=True):
     runs: Path
     started_in: Path
     wall_limit_s: float
-    """The agent's wall limit, seconds."""
     silence_s: float = SILENCE_S
     """A program without activity for this long is ended, seconds."""
     overwrite: bool = False

@@ -39,7 +39,6 @@ class Facts(msgspec.Struct, frozen=True, kw_only=True):
     """The known facts about a run."""
 
     entry: SweepRun | None = None
-    """Its entry in the index."""
     status: str | None = None
     """The status in its `run.json`."""
     opened: bool = False

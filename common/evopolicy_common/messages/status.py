@@ -73,7 +73,6 @@ class RetriedJobs(msgspec.Struct, frozen=True, kw_only=True):
     at: Number
     """Unix time, seconds."""
     worker: Word
-    """The worker that held them."""
     failure: Word
     """`worker_lost`, `failed`, `overdue`, or `unlisted` (the lease never arrived)."""
     jobs: Int = 1

@@ -237,7 +237,6 @@ class BlobPut(Message, frozen=True, kw_only=True, tag="blob_put"):
     token: Word
     digest: Word
     size: Int
-    """Size of the whole blob, bytes."""
     offset: Int
     data: Bytes
 

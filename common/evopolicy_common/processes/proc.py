@@ -24,7 +24,6 @@ class Stat(NamedTuple):
     parent: int
     session: int
     exiting: bool
-    """Whether it is on its way out."""
     cpu_s: float
     """Processor time of all its threads, and of the children that it has waited for, seconds."""
     threads: int = 1

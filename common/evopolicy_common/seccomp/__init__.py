@@ -67,7 +67,6 @@ REACHING_OUT = _parsed(
 )
 """Calls that affect other processes of the same user."""
 SET_AFFINITY = {"x86_64": 203, "aarch64": 122}
-"""`sched_setaffinity`."""
 SOCKET = {"x86_64": 41, "aarch64": 198}
 SECCOMP = {"x86_64": 317, "aarch64": 277}
 MODES = _parsed("""

@@ -62,7 +62,6 @@ class CoreHost:
         self._loop = asyncio.get_running_loop()
         self._outbox: Outbox | None = None
         self.core: Core | None = None
-        """None while no core is loaded."""
         self.last_core: Core | None = None
         """While the store cannot be written: the core that it refused, for reading."""
         self.incarnation = 0

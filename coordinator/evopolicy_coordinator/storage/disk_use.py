@@ -57,7 +57,6 @@ class Collected(msgspec.Struct, frozen=True, kw_only=True):
     shrunk: bool
     """Whether the database file was shrunk; otherwise later rows reuse its free space."""
     free_bytes: int
-    """Free on the disk afterwards."""
 
 
 class EnvironmentUse(msgspec.Struct):

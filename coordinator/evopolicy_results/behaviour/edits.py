@@ -40,7 +40,6 @@ class Transition(msgspec.Struct, frozen=True, kw_only=True):
     """One score-bearing submit and its relation to the previous one."""
 
     index: int
-    """Submit index."""
     previous: int | None
     """Index of the previous score-bearing submit; None for the first."""
     consumed_before: int
@@ -78,7 +77,6 @@ class EditRates(msgspec.Struct, frozen=True, kw_only=True):
     """Submits that changed only files outside the source bundle."""
     n_first: int = 0
     n_not_ok: int = 0
-    """Accepted submits that are not ok."""
     n_unscored: int = 0
     """Ok submits without a validation mean or a readable policy."""
 
@@ -225,7 +223,6 @@ class EditSizeBin(msgspec.Struct, frozen=True, kw_only=True):
 
     entry: str
     label: str
-    """One of `BINS`."""
     n: int
     n_visible: int
     """Number of these with visible means on both sides."""

@@ -82,7 +82,6 @@ class PublishedRun(msgspec.Struct, frozen=True, kw_only=True):
     opening_bytes: bytes
     result_bytes: bytes
     as_written: dict[str, Any]
-    """The content of `run.json`."""
 
     def cases(self, split: Split) -> tuple[Any, ...]:
         cases: tuple[Any, ...] = getattr(self.opening, split)

@@ -40,7 +40,6 @@ class Submit(msgspec.Struct, frozen=True, kw_only=True):
     index: int
     status: str
     n_episodes: int
-    """Episodes charged."""
     consumed_before: int
     """Budget spent before it, episodes."""
     consumed: int
@@ -50,7 +49,6 @@ class Submit(msgspec.Struct, frozen=True, kw_only=True):
     val_mean: float | None = None
     """Hidden validation mean, known after the run; None when not ok or not eligible."""
     n_failed_episodes: int = 0
-    """Train episodes in which the policy failed."""
     started_at: str = ""
     bundle_digest: str = ""
     """Digest of the whole `system/`, including data files; empty when unknown."""

@@ -81,7 +81,6 @@ class _Recording(msgspec.Struct, kw_only=True):
     stored: bytes | None
     """Its packed trajectory, unpacked only for the comparison: a submit's trajectories together may be gigabytes."""
     has_files: bool
-    """Whether there are feedback files to compare with."""
 
 
 class Verifier:

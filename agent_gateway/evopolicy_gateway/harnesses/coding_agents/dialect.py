@@ -50,7 +50,6 @@ class TurnReader(ABC):
 class Dialect(ABC):
     name: str
     program: tuple[str, ...]
-    """The default program."""
     cumulative = False
     """Whether its token counts are of the session, not of the turn."""
     tested_version = ""
@@ -59,7 +58,6 @@ class Dialect(ABC):
     makes_session_id = False
     """Whether the first turn starts under an id that we generate."""
     resumes = True
-    """Whether sessions can be resumed."""
     help_args: tuple[str, ...] = ()
     """Arguments that make the CLI print its options; empty: its options are not checked."""
     prompt_on_stdin = True

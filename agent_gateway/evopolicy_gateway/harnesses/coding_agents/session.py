@@ -19,7 +19,6 @@ class SessionState(msgspec.Struct, kw_only=True):
     """The CLI's id of the session; None until the CLI has reported it."""
     cli_version: str | None = None
     turns: int = 0
-    """Turns that the agent completed."""
     retries: int = 0
     """Turns started again after a failure."""
     reprompts: int = 0

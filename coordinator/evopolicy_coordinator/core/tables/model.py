@@ -123,7 +123,6 @@ class Template:
     env: str
     bundle: str | None
     cases: tuple[Case, ...]
-    """One for each index."""
     case_ids: tuple[int, ...]
     occurrences: tuple[int, ...]
     secret: bytes | None
@@ -172,7 +171,6 @@ class JobState:
     n: int
     """Number of its episodes."""
     attempts: int
-    """Number of the last attempt."""
     priority: int
     generation: int = 0
     """Incremented whenever the job enters or leaves the queue; queue entries with an older generation are void."""
@@ -184,7 +182,6 @@ class JobState:
     failures_counted: int = 0
     """Faults after which the submit's wall-clock limit has started again."""
     last_failure: str = ""
-    """The last failure and its worker, for an operator."""
     faults: EnvironmentFaults = field(default_factory=EnvironmentFaults)
     avoid: str | None = None
     """The worker that it last failed on: not leased to it before `avoid_until`, if its lane has another one."""
@@ -596,7 +593,6 @@ class Worker:
     held: list[int] = field(default_factory=partial(by_priority, int))
     """Live leases by priority."""
     n_live: int = 0
-    """Live leases in all."""
     poll: LeasePoll | None = None
     polled_at: float | None = None
     """When it last polled; None for never."""

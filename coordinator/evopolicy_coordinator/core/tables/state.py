@@ -1,4 +1,4 @@
-"""All state of a core: tables of open work and indices into them, without rules. `loading` fills it;
+"""All state of a core: tables of open work and indices into them, without rules. `machine.load` fills it;
 the rules change it."""
 
 from __future__ import annotations
@@ -104,7 +104,6 @@ class State:
         self.profiles: dict[ProfileKey, Profile] = {}
         self.unpinned: dict[str, Flow] = {}
         self.n_flows = 0
-        """Number of flows created so far."""
         self.suspects: dict[JobState, None] = {}
         """Waiting jobs that are to run alone; few."""
         self.clock = [0.0] * len(RANKS)
@@ -117,11 +116,9 @@ class State:
         self.awaited: dict[str, None] = {}
         """Undescribed environments that an operator requested."""
         self.sessions: dict[str, str] = {}
-        """Current session to its worker."""
         self.out_of_service: dict[str, OutOfService] = {}
         """Names that an operator drained or paused; kept over restarts."""
         self.n_live = 0
-        """Live leases in all."""
         self.freed: dict[str, None] = {}
         """Workers that released a lease, or are no longer emptied: their waiting poll may be answerable now."""
 

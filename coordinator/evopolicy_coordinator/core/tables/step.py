@@ -129,7 +129,6 @@ class Step:
         self._rows: list[Row] = []
         self._out: list[Effect] = []
         self.news: deque[News] = deque()
-        """Undelivered news, in order."""
         self.last: Reply | None = None
         """The reply that is sent after the news was delivered."""
         self.grown: dict[JobGroup, None] = {}
