@@ -81,6 +81,14 @@ def counted(n: int, what: str) -> str:
     return f"{n:,} {what}{'s' * (n != 1)}"
 
 
+def short(value: float) -> str:
+    """A large number in few characters."""
+    for size, letter in ((1e9, "G"), (1e6, "M"), (1e3, "k")):
+        if value >= size:
+            return f"{value / size:.3g}{letter}"
+    return f"{value:g}"
+
+
 def duration(seconds: float | None) -> str:
     """How long something takes, such as `5 min`; a dash for None."""
     if seconds is None:

@@ -18,7 +18,7 @@ from evopolicy_common.console import Terminal, table
 from evopolicy_common.messages.gateway import FREE_SLOT
 from evopolicy_common.records.suite_folder import FINISHED, SweepRun
 from evopolicy_common.records.words import in_words
-from evopolicy_common.terminal import number, say_json
+from evopolicy_common.terminal import duration, number, say_json, short
 from evopolicy_gateway.processes.child_messages import AgentDoing
 from evopolicy_gateway.relay.usage import tokens_in
 from evopolicy_gateway.run.watch import PHASES, Row, View
@@ -103,11 +103,11 @@ class SuiteView(View):
         parts.append(f"{count['running']} running")
         parts += [f"{count[state]} {word}" for state, word in _ENDED_OTHERWISE.items() if count[state]]
         if tokens := sum(tokens_in(row.tokens) for row in rows):
-            parts.append(f"{_short(tokens)} tokens")
+            parts.append(f"{short(tokens)} tokens")
         if cost := sum(float((row.tokens or {}).get("cost") or 0.0) for row in rows):
             parts.append(f"${cost:.2f}")
         eta = self._eta()
-        return ", ".join(parts) + ("" if eta is None else f", about {_duration(eta)} left")
+        return ", ".join(parts) + ("" if eta is None else f", about {duration(eta)} left")
 
     def _eta(self) -> float | None:
         """Estimated seconds left, from the durations of finished runs; None before the first."""
@@ -177,7 +177,7 @@ def results_table(entries: list[SweepRun]) -> Table:
         tokens = tokens_in(entry.tokens)
         place = f" on {entry.host}" if entry.host and not entry.directory else ""
         cells = (number(entry.score), number(entry.random), str(entry.budget_used))
-        shown = _short(tokens) if tokens else ""
+        shown = short(tokens) if tokens else ""
         made.add_row(Text(entry.name), in_words(entry.state) + place, *cells, shown)
     return made
 
@@ -232,18 +232,7 @@ def _cells(row: Row) -> tuple[str, ...]:
         used,
         submits,
         "" if progress is None else number(progress.best_mean),
-        _short(tokens) if tokens else "",
+        short(tokens) if tokens else "",
         state,
         f"waiting for {row.waits_for}" if row.state == "running" and row.waits_for else row.action,
     )
-
-
-def _short(number: int) -> str:
-    if number >= 1_000_000:
-        return f"{number / 1e6:.2f}M"
-    return f"{number / 1e3:.1f}k" if number >= 1000 else str(number)
-
-
-def _duration(seconds: float) -> str:
-    minutes = round(seconds / 60)
-    return f"{minutes // 60} h {minutes % 60} min" if minutes >= 60 else f"{max(1, minutes)} min"

@@ -27,10 +27,10 @@ from starlette.responses import HTMLResponse, PlainTextResponse, RedirectRespons
 from starlette.routing import Route
 from starlette.types import ASGIApp
 
-from evopolicy_common.confined import Confined, NotThereError
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.logs import log
 from evopolicy_common.messages.status import StatusReply
+from evopolicy_common.regular_files import Confined, NotThereError
 from evopolicy_common.wire.credentials import Credentials
 from evopolicy_common.wire.http import bound, serving
 from evopolicy_coordinator.web.access import Access, Guard

@@ -33,14 +33,13 @@ from invented.run_dirs import write_run
 
 from evopolicy import load_runs as load_public_runs
 from evopolicy._exports import tables, tracking, transcripts
-from evopolicy_common.confined import NotThereError
 from evopolicy_common.errors import ConfigError, EvopolicyError, ProtocolError
 from evopolicy_common.records.episodes import compare
 from evopolicy_common.records.episodes.npz import read_arrays
 from evopolicy_common.records.policies.submits import read_submits
 from evopolicy_common.records.run_difference import differences
 from evopolicy_common.records.run_record import Artifacts, encode_run_record
-from evopolicy_common.regular_files import read_regular
+from evopolicy_common.regular_files import NotThereError, read_regular
 from evopolicy_coordinator.web.content.run_detail import Detail
 from evopolicy_coordinator.web.content.run_folders import Reader
 from evopolicy_gateway.harbor import scores

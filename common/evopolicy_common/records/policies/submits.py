@@ -10,12 +10,11 @@ from collections.abc import Iterable
 from functools import cached_property
 from pathlib import Path
 
-from evopolicy_common.confined import Confined, Name
 from evopolicy_common.errors import ProtocolError, raised_as
 from evopolicy_common.records.policies.checkpoints import CheckpointMeta, read_meta
 from evopolicy_common.records.run_record import Artifacts
 from evopolicy_common.records.summary import Summary, decode_summary
-from evopolicy_common.regular_files import MAX_BYTES
+from evopolicy_common.regular_files import MAX_BYTES, Confined, Name
 
 _SUBMIT = re.compile(r"submit_([0-9]{3,9})")
 

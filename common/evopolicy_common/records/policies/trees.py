@@ -23,7 +23,7 @@ from typing import BinaryIO
 
 import msgspec
 
-from evopolicy_common.errors import DECODE_ERRORS, BundleError, ConfigError, StorageError
+from evopolicy_common.errors import DECODE_ERRORS, BundleError, ConfigError, StorageError, raised_as
 from evopolicy_common.records.blobs import BlobStore, digest_of, sync_filesystem, write_atomically
 from evopolicy_common.records.policies.bundles import FOLDER, Bundle, BundleFile, check_path, walk, write_new
 from evopolicy_common.records.secrets import Passed, positions
@@ -109,7 +109,8 @@ def submit_number(name: str) -> int | None:
 def read_tree(folder: Path, submit: str) -> tuple[Tree, str]:
     """A tree of the run at `folder`, and its digest. Raises ConfigError for a missing or damaged one."""
     path = folder / TREES / f"{submit}.json"
-    try:
+    remedy = f"; name a submit whose workspace is recorded in {path.parent}"
+    with raised_as(ConfigError, path, OSError, BundleError, *DECODE_ERRORS, remedy=remedy):
         data = read_regular(path, _MAX_MANIFEST)
         tree = msgspec.json.decode(data, type=Tree)
         names = [file.path for file in tree.files]
@@ -121,11 +122,6 @@ def read_tree(folder: Path, submit: str) -> tuple[Tree, str]:
             raise BundleError(f"{len(names)} files, some of one name, or more than {MAX_FILES}")
         if sum(file.size for file in tree.files) > MAX_TREE_BYTES:
             raise BundleError(f"more than {MAX_TREE_BYTES:,} bytes")
-    except (OSError, BundleError, *DECODE_ERRORS) as error:
-        why = getattr(error, "strerror", None) or str(error)
-        raise ConfigError(
-            f"{path}: {why}; name a submit whose workspace is recorded in {path.parent}"
-        ) from error
     return tree, digest_of(data)
 
 

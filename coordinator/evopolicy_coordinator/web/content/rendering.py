@@ -14,6 +14,7 @@ import msgspec
 from jinja2 import ChoiceLoader, Environment, PackageLoader
 
 from evopolicy_common.records.words import in_words
+from evopolicy_common.terminal import short
 from evopolicy_coordinator.web.content.run_folders import key_of
 from evopolicy_results import html
 from evopolicy_results.html import View
@@ -76,14 +77,6 @@ def part(name: str, /, **values: Any) -> str:
 def page(template: str, *, view: View | None = None, live: str = "", **values: Any) -> str:
     """A whole page; `live` are the ids of the elements that are kept up to date."""
     return html.page(template, view=view, own=_environment(), live=live, frame="web.html.j2", **values)
-
-
-def short(value: float) -> str:
-    """A large number in few characters."""
-    for size, letter in ((1e9, "G"), (1e6, "M"), (1e3, "k")):
-        if value >= size:
-            return f"{value / size:.3g}{letter}"
-    return f"{value:g}"
 
 
 def state_words(state: str) -> str:

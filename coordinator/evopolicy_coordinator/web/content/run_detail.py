@@ -18,7 +18,6 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from evopolicy_common.confined import Confined, NotThereError
 from evopolicy_common.errors import DECODE_ERRORS, BundleError
 from evopolicy_common.messages.bounds import LARGEST
 from evopolicy_common.messages.gateway import SubmitAccepted
@@ -31,6 +30,7 @@ from evopolicy_common.records.open_run import Requested
 from evopolicy_common.records.policies import bundles
 from evopolicy_common.records.policies.checkpoints import METADATA
 from evopolicy_common.records.words import in_words
+from evopolicy_common.regular_files import Confined, NotThereError
 from evopolicy_common.terminal import event_text
 from evopolicy_results.figures.line_chart import Line
 

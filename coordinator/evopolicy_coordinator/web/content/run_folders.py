@@ -18,7 +18,6 @@ from typing import Any, TypeVar
 
 import msgspec
 
-from evopolicy_common.confined import MAX_NAMES, Confined
 from evopolicy_common.errors import DECODE_ERRORS, ProtocolError
 from evopolicy_common.messages.operator import CreateRun
 from evopolicy_common.messages.run_settings import Start
@@ -28,7 +27,7 @@ from evopolicy_common.records.policies.submits import read_submits
 from evopolicy_common.records.run_files import RUN_JSON, read_record
 from evopolicy_common.records.suite_folder import INDEX, PAUSED, Index, SweepRun
 from evopolicy_common.records.summary import Summary
-from evopolicy_common.regular_files import read_regular
+from evopolicy_common.regular_files import MAX_NAMES, Confined, read_regular
 from evopolicy_results.reading.environments import learn_names
 from evopolicy_results.reading.reader import find_run_dirs
 from evopolicy_results.reading.records import Submit

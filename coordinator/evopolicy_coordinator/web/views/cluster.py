@@ -10,10 +10,10 @@ from typing import Any
 
 from evopolicy_common.cli.conventions import bytes_text
 from evopolicy_common.messages.status import DiskUse, StatusReply, WorkerStatus
-from evopolicy_common.terminal import duration
+from evopolicy_common.terminal import duration, short
 from evopolicy_coordinator.web.content.cluster import Cluster
 from evopolicy_coordinator.web.content.remarks import remarks, served_by
-from evopolicy_coordinator.web.content.rendering import PAGE_ROWS, Words, ident, paged, part, short
+from evopolicy_coordinator.web.content.rendering import PAGE_ROWS, Words, ident, paged, part
 from evopolicy_coordinator.web.content.run_folders import RunFacts, Runs
 from evopolicy_results.html import View, notice
 from evopolicy_results.reading.environments import title_of

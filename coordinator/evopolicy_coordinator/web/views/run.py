@@ -11,13 +11,13 @@ from urllib.parse import urlencode
 
 from markupsafe import Markup
 
-from evopolicy_common.confined import NotThereError
 from evopolicy_common.messages.status import RetriedJobs
 from evopolicy_common.records import model_calls
 from evopolicy_common.records.policies.trees import changes
 from evopolicy_common.records.summary import utc_text
-from evopolicy_common.terminal import counted, duration, number
-from evopolicy_coordinator.web.content.rendering import Words, ident, part, short, state_words
+from evopolicy_common.regular_files import NotThereError
+from evopolicy_common.terminal import counted, duration, number, short
+from evopolicy_coordinator.web.content.rendering import Words, ident, part, state_words
 from evopolicy_coordinator.web.content.run_detail import IMAGES, MAX_WORDS, CodeFile, Detail, Happened
 from evopolicy_coordinator.web.content.run_folders import Reader, RunFacts, Runs
 from evopolicy_results.behaviour.trace import Trace, diff, trace

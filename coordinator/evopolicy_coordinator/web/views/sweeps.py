@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Any
 
 from evopolicy_common.cli.conventions import bytes_text
-from evopolicy_common.terminal import counted, duration, number
+from evopolicy_common.terminal import counted, duration, number, short
 from evopolicy_coordinator.web.content.cluster import Cluster
-from evopolicy_coordinator.web.content.rendering import STATES, Words, ident, paged, part, short, state_words
+from evopolicy_coordinator.web.content.rendering import STATES, Words, ident, paged, part, state_words
 from evopolicy_coordinator.web.content.run_folders import RunFacts, Runs, Sweep
 from evopolicy_results.html import View, notice
 from evopolicy_results.reading.environments import title_of
