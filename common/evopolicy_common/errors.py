@@ -111,4 +111,5 @@ def raised_as(
     try:
         yield
     except causes as error:
-        raise kind(f"{problem}: {getattr(error, 'strerror', None) or error}{remedy}") from error
+        reason = getattr(error, "strerror", None) or error
+        raise kind(f"{problem}: {reason}" + (f"; {remedy}" if remedy else "")) from error

@@ -55,7 +55,7 @@ def read_regular(
 
 def read_given(path: Path, name: str, most: int = MAX_BYTES) -> bytes:
     """The bytes of a file that the user names, also by a link. Raises ConfigError, which calls the file `name`."""
-    remedy = "; name a regular file that this user may read"
+    remedy = "name a regular file that this user may read"
     with raised_as(ConfigError, f"{name} cannot be read", OSError, ValueError, remedy=remedy):
         return read_regular(path, most, links=True)
 

@@ -342,7 +342,8 @@ def find_start(text: str, started_in: Path) -> StartPoint:
             " runs/evolve/gym_acrobot/first@submit_007"
         )
     folder = RunFolder((started_in / place).absolute())
-    try:
+    remedy = "name a run directory"
+    with raised_as(ConfigError, f"--start-from {text}: no run is there", OSError, remedy=remedy):
         # A folder of another user's making could name any run and hold any files.
         if folder.root.stat().st_uid != os.getuid():
             raise ConfigError(
@@ -350,10 +351,6 @@ def find_start(text: str, started_in: Path) -> StartPoint:
             )
         finished = folder.run_json.exists()
         run = read_record(folder.root).run if finished else saved(folder.intended, CreateRun).run
-    except OSError as error:
-        raise ConfigError(
-            f"--start-from {text}: no run is there: {error.strerror}; name a run directory"
-        ) from error
     tree, digest = trees.read_tree(folder.root, submit)
     if not (folder.feedback / submit).is_dir():
         raise ConfigError(f"--start-from {text}: the submit has no feedback yet; wait until it is played")

@@ -16,7 +16,7 @@ from typing import TypeVar
 import msgspec
 
 from evopolicy_common.catalogue import folder_name
-from evopolicy_common.errors import DECODE_ERRORS, ConfigError
+from evopolicy_common.errors import DECODE_ERRORS, ConfigError, raised_as
 from evopolicy_common.messages.operator import CreateRun
 from evopolicy_common.records import model_calls, model_record, open_run
 from evopolicy_common.records.blobs import write_atomically
@@ -182,12 +182,9 @@ def save(path: Path, value: msgspec.Struct) -> None:
 
 def saved(path: Path, kind: type[T]) -> T:
     """Reads a file written by `save`. Raises FileNotFoundError when it is missing, ConfigError when it is damaged."""
-    try:
+    remedy = "restore it from a backup, or restart the run with --overwrite"
+    with raised_as(ConfigError, f"{path} is damaged", *DECODE_ERRORS, remedy=remedy):
         return msgspec.json.decode(path.read_bytes(), type=kind)
-    except DECODE_ERRORS as error:
-        raise ConfigError(
-            f"{path} is damaged: {error}; restore it from a backup, or restart the run with --overwrite"
-        ) from error
 
 
 def folder_of(path: Path) -> RunFolder:

@@ -140,12 +140,9 @@ def read_file(path: Path) -> tuple[Entry, ...]:
         raise ConfigError(f"environment file {path} is not TOML: {error}") from error
     tables = [table]
     if "environment" in table:
-        try:
+        remedy = "several environments are [[environment]] tables"
+        with raised_as(ConfigError, f"environment file {path}", msgspec.ValidationError, remedy=remedy):
             tables = list(msgspec.convert(table, _Many).environment)
-        except msgspec.ValidationError as error:
-            raise ConfigError(
-                f"environment file {path}: {error}; several environments are [[environment]] tables"
-            ) from error
     entries = tuple(_entry(path, each) for each in tables)
     if doubled := sorted(name for name, n in Counter(each.id for each in entries).items() if n > 1):
         names = ", ".join(doubled)
@@ -191,7 +188,7 @@ def _task(where: str, path: Path, fields: dict[str, object], task_file: object) 
         raise ConfigError(
             f"{what} is {place}, outside the environment file's folder {folder}: copy the text into that folder"
         )
-    with raised_as(ConfigError, f"{what} is not UTF-8", UnicodeDecodeError, remedy="; save it as UTF-8"):
+    with raised_as(ConfigError, f"{what} is not UTF-8", UnicodeDecodeError, remedy="save it as UTF-8"):
         return read_given(place, what, MAX_FILE_BYTES).decode()
 
 

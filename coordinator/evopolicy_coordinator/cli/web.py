@@ -15,7 +15,7 @@ import typer
 
 from evopolicy_common.cli.conventions import Connect, CredentialsFile, end_on_sigterm, setup_logging
 from evopolicy_common.cli.frame import App
-from evopolicy_common.errors import ConfigError, EvopolicyError
+from evopolicy_common.errors import ConfigError, EvopolicyError, raised_as
 from evopolicy_common.regular_files import read_given
 from evopolicy_common.terminal import say
 from evopolicy_common.wire import credentials, transport
@@ -121,13 +121,9 @@ def web(
 
 def _check_certificate(certificate: Path) -> None:
     read_given(certificate, f"--tls-certificate {certificate}")
-    try:
+    remedy = "name a file with a certificate and its key, both in PEM (cat cert.pem key.pem)"
+    with raised_as(ConfigError, f"--tls-certificate {certificate}", OSError, remedy=remedy):
         ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER).load_cert_chain(certificate)
-    except OSError as error:
-        raise ConfigError(
-            f"--tls-certificate {certificate}: {error.strerror or error}; name a file with a certificate and its key,"
-            " both in PEM (cat cert.pem key.pem)"
-        ) from error
 
 
 async def _is_reachable(own: Credentials) -> bool:

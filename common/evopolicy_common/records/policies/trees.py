@@ -109,7 +109,7 @@ def submit_number(name: str) -> int | None:
 def read_tree(folder: Path, submit: str) -> tuple[Tree, str]:
     """A tree of the run at `folder`, and its digest. Raises ConfigError for a missing or damaged one."""
     path = folder / TREES / f"{submit}.json"
-    remedy = f"; name a submit whose workspace is recorded in {path.parent}"
+    remedy = f"name a submit whose workspace is recorded in {path.parent}"
     with raised_as(ConfigError, path, OSError, BundleError, *DECODE_ERRORS, remedy=remedy):
         data = read_regular(path, _MAX_MANIFEST)
         tree = msgspec.json.decode(data, type=Tree)
