@@ -170,11 +170,6 @@ Schema = dict
 '''
 
 
-def policy_source() -> str:
-    """The text of `system/policy.py`."""
-    return "\n\n".join([HEADER, *(inspect.getsource(part) for part in (features, actions, Policy))])
-
-
 # ---- the agent ----
 
 
@@ -301,7 +296,8 @@ class Agent:
         mean, deviation = (values.tolist() for values in self._normal)
         given = {"mean": mean, "deviation": deviation, "candidates": candidates.tolist()}
         system = self._workspace / "system"
-        (system / "policy.py").write_text(policy_source(), encoding="utf-8")
+        source = [HEADER, *(inspect.getsource(part) for part in (features, actions, Policy))]
+        (system / "policy.py").write_text("\n\n".join(source), encoding="utf-8")
         (system / "parameters.json").write_text(json.dumps(given), encoding="utf-8")
 
 

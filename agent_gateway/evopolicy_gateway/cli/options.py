@@ -7,7 +7,7 @@ as `Annotated[type, Of(Struct)]`.
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple, get_args, get_origin
 
@@ -117,7 +117,11 @@ def spread(command: Callable[..., None]) -> Callable[..., None]:
         parsed |= {one.name: one.option.parse for one in options if one.option.parse is not None}
 
     if rare:
-        parameters.append(_set_parameter(list(rare)))
+        text = f"A further setting (docs/reference/options.md): {', '.join(rare)}; may be repeated."
+        shown = typer.Option(SET, metavar="NAME=VALUE", help=text, show_default=False, rich_help_panel=RUN)
+        several: Any = Annotated[Several, shown]
+        only = inspect.Parameter.KEYWORD_ONLY
+        parameters.append(inspect.Parameter("set_", only, default=None, annotation=several))
 
     def flat(**values: Any) -> None:
         with fail_on_our_errors():
@@ -134,14 +138,6 @@ def spread(command: Callable[..., None]) -> Callable[..., None]:
     flat.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
     flat.__annotations__ = {each.name: each.annotation for each in parameters}
     return flat
-
-
-def _set_parameter(names: Sequence[str]) -> inspect.Parameter:
-    text = f"A further setting (docs/reference/options.md): {', '.join(names)}; may be repeated."
-    shown = typer.Option(SET, metavar="NAME=VALUE", help=text, show_default=False, rich_help_panel=RUN)
-    return inspect.Parameter(
-        "set_", inspect.Parameter.KEYWORD_ONLY, default=None, annotation=Annotated[Several, shown]
-    )
 
 
 def _parameter(one: Declared, text: str) -> inspect.Parameter:

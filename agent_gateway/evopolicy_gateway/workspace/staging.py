@@ -83,15 +83,10 @@ def _in_box(space: SpaceSchema) -> Any:
     return _box(list(space["shape"]), low, high, number)
 
 
-def _image(space: SpaceSchema) -> Any:
-    lowest, highest = space["value_range"]
-    return _box(list(space["shape"]), lowest, highest, int)
-
-
 _CONSTANT: dict[str, Callable[[SpaceSchema], Any]] = {
     "Discrete": lambda space: int(space.get("start", 0)),
     "Box": _in_box,
-    "Image": _image,
+    "Image": lambda space: _box(list(space["shape"]), *space["value_range"], int),
     "MultiDiscrete": lambda space: _like(space["nvec"], space.get("start", 0)),
     "MultiBinary": lambda space: _box(
         space["n"] if isinstance(space["n"], list) else [space["n"]], 0, 1, int

@@ -44,7 +44,9 @@ def chart(
         return ""
     if reference is not None:
         values.append(reference[1])
-    low, high = _padded(min(values), max(values))
+    low, high = min(values), max(values)
+    room = (high - low) * 0.06 or max(1.0, abs(high) * 0.1)
+    low, high = low - room if low < 0 else max(0.0, low - room), high + room
     x_low, x_high = min(0.0, *xs), max(x_max or 0.0, *xs, 1e-9)
 
     def x(value: float) -> float:
@@ -143,11 +145,6 @@ def _thinned(points: Sequence[tuple[float, float]]) -> list[tuple[float, float]]
         ends = {min(stretch, key=lambda point: point[1]), max(stretch, key=lambda point: point[1])}
         kept += sorted(ends)
     return kept
-
-
-def _padded(low: float, high: float) -> tuple[float, float]:
-    room = (high - low) * 0.06 or max(1.0, abs(high) * 0.1)
-    return low - room if low < 0 else max(0.0, low - room), high + room
 
 
 def _ticks(low: float, high: float) -> list[float]:

@@ -118,7 +118,13 @@ def plan(
             config["landlock"] = {"read": ["/"], "write": ["/tmp", "/dev"]}
         as_root = os.geteuid() == 0
         config["become_nobody"] = as_root
-        config |= _own_files(files)
+        # Folders that the zygote replaces by copies (of `libraries`, only the files needed), and where it makes them.
+        folders: list[str] = []
+        libraries: list[str] = []
+        for path in filter(os.path.isdir, files.read):
+            (libraries if path in files.libraries else folders).append(_shown_at(path))
+        folders += [f"{_PACKAGES}/{name}" for name, path in files.packages.items() if os.path.isdir(path)]
+        config |= {"folders": [*folders, "/sandbox"], "libraries": libraries, "place": _PLACE}
         return Jail(
             command=(*_bubblewrap(files, as_root), *_python(files, "/sandbox")),
             config=config,
@@ -226,17 +232,6 @@ def _bubblewrap(files: _PythonFiles, as_root: bool) -> list[str]:
     for path in (POLICY_HOME, "/tmp", _PLACE):
         command += ["--dir", path]
     return [*command, "--chdir", "/", "--remount-ro", "/"]
-
-
-def _own_files(files: _PythonFiles) -> dict[str, object]:
-    """Folders that the zygote replaces by copies (of `libraries`, only the files needed), and the folder where it makes
-    them."""
-    folders: list[str] = []
-    libraries: list[str] = []
-    for path in filter(os.path.isdir, files.read):
-        (libraries if path in files.libraries else folders).append(_shown_at(path))
-    packages = [f"{_PACKAGES}/{name}" for name, path in files.packages.items() if os.path.isdir(path)]
-    return {"folders": [*folders, *packages, "/sandbox"], "libraries": libraries, "place": _PLACE}
 
 
 def _shown_at(path: str) -> str:

@@ -34,13 +34,16 @@ from evopolicy_coordinator.core.tables.step import EpisodesDone, Step, SubmitEnd
 
 
 def submit(state: State, event: events.Requested[gateway.Submit], step: Step) -> None:
-    """Accept a submit, or refuse it for the first cause in the protocol's order; a known key
+    """Accept a submit, or refuse it for the first cause in the protocol's order; the same request with a known key
     gets the earlier answer."""
     message = event.message
     run = requests.live(state, message.run)
     known = run.keys.get(message.key)
     if known is not None:
-        _again(event, run.submits[known], step)
+        row = run.submits[known]
+        if (message.env_instances, message.bundle) != (row.env_instances, row.bundle):
+            raise NotDoneError("key_used", key=message.key, submit=row.submit_index)
+        step.reply(event.request, submit_accepted(row))
         return
     if run.state.phase != "open":
         raise NotDoneError(requests.over(state, run.id))
@@ -58,14 +61,6 @@ def submit(state: State, event: events.Requested[gateway.Submit], step: Step) ->
         raise NotDoneError("no_bundle")
     requests.demand_permit(state, run, step)
     _accept(state, run, event, step)
-
-
-def _again(event: events.Requested[gateway.Submit], row: SubmitRow, step: Step) -> None:
-    """Answer a known key as the first time if the request is the same; otherwise refuse it (KEY_CONFLICT)."""
-    message = event.message
-    if (message.env_instances, message.bundle) != (row.env_instances, row.bundle):
-        raise NotDoneError("key_used", key=message.key, submit=row.submit_index)
-    step.reply(event.request, submit_accepted(row))
 
 
 def _accept(state: State, run: Run, event: events.Requested[gateway.Submit], step: Step) -> None:

@@ -46,19 +46,15 @@ def fingerprint() -> Fingerprint:
     for root in (Path(evopolicy_common.__path__[0]), _ROOT):
         for path in sorted(path for path in root.rglob("*") if path.suffix in (".py", ".toml", ".md")):
             digest.update(str(path.relative_to(root)).encode() + b"\0" + path.read_bytes() + b"\0")
+    # The instruction sets that numpy dispatches on here. Numerical libraries select their code by them.
+    config = np.show_config(mode="dicts")
+    simd = config.get("SIMD Extensions", {}) if isinstance(config, dict) else {}
     return Fingerprint(
         code_version=f"{evopolicy_common.__version__}+{digest.hexdigest()[:12]}",
         python=platform.python_version(),
         packages=versions(PACKAGES),
-        cpu=f"{platform.machine()} {_simd_features()}",
+        cpu=f"{platform.machine()} {'+'.join([*simd.get('baseline', []), *simd.get('found', [])])}",
     )
-
-
-def _simd_features() -> str:
-    """The instruction sets that numpy dispatches on here. Numerical libraries select their code by them."""
-    config = np.show_config(mode="dicts")
-    simd = config.get("SIMD Extensions", {}) if isinstance(config, dict) else {}
-    return "+".join([*simd.get("baseline", []), *simd.get("found", [])])
 
 
 def adapter(family: type, revision: int, gymnasium_id: str) -> str:
