@@ -13,7 +13,7 @@ import msgspec
 
 from evopolicy_common.errors import BrokenEnvironmentError
 from evopolicy_common.messages.environment import Split
-from evopolicy_common.messages.episode import BlobRef, EpisodeOutcome, Record, ResourceLimits, Tier
+from evopolicy_common.messages.episode import RANDOM, BlobRef, EpisodeOutcome, Record, ResourceLimits, Tier
 from evopolicy_common.messages.operator import (
     DescribeEnvironment,
     EnvironmentState,
@@ -31,8 +31,6 @@ from evopolicy_common.wire.transport import Link
 
 Tell = Callable[[int, str], None]
 """Called with the number of finished episodes and the reason why the cluster waits (empty: none)."""
-RANDOM = -1
-"""Submit index of the random reference."""
 _WORKER_PAUSE_S = 0.3
 
 

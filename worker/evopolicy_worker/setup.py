@@ -28,6 +28,7 @@ from evopolicy_common.catalogue.installs import Install, Made
 from evopolicy_common.cli.conventions import fail_on_our_errors
 from evopolicy_common.errors import ConfigError, MachineError
 from evopolicy_common.installation import source
+from evopolicy_common.processes.packages import canonical
 from evopolicy_common.processes.parent_death import ending_with_parent
 from evopolicy_common.processes.preflight import check_writable
 from evopolicy_common.terminal import one_line, say
@@ -127,7 +128,9 @@ def requirement(extras: str) -> list[str]:
 def constraints(wanted: Mapping[str, Install]) -> str:
     """Lines for pip: those of `constraints.txt`, with the families' pins in place of their own."""
     pins = {
-        _normal(name): f"{name}=={version}" for each in wanted.values() for name, version in each.pins.items()
+        canonical(name): f"{name}=={version}"
+        for each in wanted.values()
+        for name, version in each.pins.items()
     }
     package = Path(evopolicy_common.__file__).parent
     # In a wheel it is among the shipped files, in a checkout at its top.
@@ -136,12 +139,8 @@ def constraints(wanted: Mapping[str, Install]) -> str:
     if usual is None:
         raise ConfigError("constraints.txt is missing from this installation: install evopolicy again")
     lines = usual.read_text("utf-8").splitlines()
-    kept = [line for line in lines if _normal(re.split(r"[=;]", line)[0]) not in pins]
+    kept = [line for line in lines if canonical(re.split(r"[=;]", line)[0].strip()) not in pins]
     return "\n".join([*kept, *pins.values()]) + "\n"
-
-
-def _normal(name: str) -> str:
-    return re.sub(r"[-_.]+", "-", name.strip()).lower()
 
 
 def _run(program: Sequence[str], part: str) -> None:

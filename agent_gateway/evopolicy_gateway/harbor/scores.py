@@ -36,6 +36,7 @@ from evopolicy_common.records.run_files import read_record
 from evopolicy_common.records.words import in_words
 from evopolicy_common.terminal import say
 from evopolicy_common.wire.http import bound, serving
+from evopolicy_gateway.harnesses.coding_agents.codex import toml
 from evopolicy_gateway.run_folder.layout import RunFolder, folder_of, saved
 from evopolicy_gateway.run_folder.listener import TOKEN_VARIABLE, Listener, finish, listener_of
 from evopolicy_gateway.workspace.agents_md import base_url
@@ -77,11 +78,6 @@ def task_name(folder: RunFolder) -> str:
     return "-".join(filter(None, words)).lower()
 
 
-def _toml(text: str) -> str:
-    """As a TOML string, which differs from JSON's: it has no surrogates, and DEL is escaped."""
-    return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007f")
-
-
 def task_files(folder: RunFolder, *, env: str, url: str, token: str, agent_s: float) -> Mapping[str, str]:
     """The task's files by path. `url`, `token`: where its verifier gets the score; `agent_s`: the agent's time,
     seconds."""
@@ -100,11 +96,11 @@ schema_version = "1.4"
 
 [task]
 name = "evopolicy/{name}"
-description = {_toml(f"Improve a policy for {env}; the reward is its mean return on hidden cases.")}
+description = {toml(f"Improve a policy for {env}; the reward is its mean return on hidden cases.")}
 
 [metadata]
-env = {_toml(env)}
-run = {_toml(str(folder.root))}
+env = {toml(env)}
+run = {toml(str(folder.root))}
 
 [environment]
 env = {{ {TOKEN_VARIABLE} = "{bearer}" }}

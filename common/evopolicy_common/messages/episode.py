@@ -33,6 +33,9 @@ NO_POLICY: frozenset[str] = frozenset({"missing_policy", "denied_import", "impor
 TIME_LIMITS: frozenset[str] = frozenset({"act_timeout", "episode_timeout", "cpu_limit"})
 """Failure categories that the summary also lists under `timeouts`."""
 
+RANDOM = -1
+"""Submit index of the random reference."""
+
 Record = Literal["full", "actions"]
 """A worker's record of an episode: the whole trajectory, or (for hidden episodes) only the action log."""
 

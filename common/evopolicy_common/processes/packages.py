@@ -74,9 +74,9 @@ def files_of(names: Iterable[str], *, metadata_too: bool = False) -> dict[str, s
 
 def check_alone(names: Iterable[str]) -> None:
     """Raises ConfigError when other distributions have files in the folders of these: they would be shown with them."""
-    tops, known = files_of(names), {_canonical(name) for name in versions_of(names)}
+    tops, known = files_of(names), {canonical(name) for name in versions_of(names)}
     for top in tops:
-        if others := sorted(owner for owner in _owners().get(top, ()) if _canonical(owner) not in known):
+        if others := sorted(owner for owner in _owners().get(top, ()) if canonical(owner) not in known):
             raise ConfigError(
                 f"the folder {top} belongs to {', '.join(others)} too, and cannot be shown alone"
             )
@@ -153,7 +153,7 @@ def _one(
     }
     simulators = {top.partition(".")[0] for top in entries} & set(SIMULATORS)
     simulators |= {point.name for point in distribution.entry_points if point.group in _ENVIRONMENTS}
-    simulators |= {"evopolicy"} if _canonical(distribution.metadata["Name"]) == "evopolicy" else set()
+    simulators |= {"evopolicy"} if canonical(distribution.metadata["Name"]) == "evopolicy" else set()
     if simulators:
         which = "is" if name == requested else f"requires {name}, which is"
         raise ConfigError(
@@ -211,5 +211,5 @@ def _owners() -> dict[str, set[str]]:
     return owners
 
 
-def _canonical(name: str) -> str:
+def canonical(name: str) -> str:
     return re.sub(r"[-_.]+", "-", name).lower()

@@ -26,6 +26,7 @@ from evopolicy_common.catalogue.worlds import OPTION, unchanged
 from evopolicy_common.errors import ConfigError, RefusedError
 from evopolicy_common.messages import operator
 from evopolicy_common.messages.environment import Case, Split, StepLimit
+from evopolicy_common.messages.episode import RANDOM
 from evopolicy_common.messages.run_settings import (
     MAX_EPISODES_PER_SUBMIT,
     PUBLISHED_TRAIN,
@@ -47,7 +48,6 @@ from evopolicy_coordinator.core.contract.events import (
 )
 from evopolicy_coordinator.core.contract.reasons import because
 from evopolicy_coordinator.core.contract.records import EvaluationRow, RunRow
-from evopolicy_coordinator.core.runs.templates import RANDOM
 from evopolicy_coordinator.pki.identity import of_run
 from evopolicy_coordinator.server.reader import ServiceReader
 from evopolicy_coordinator.server.reason_texts import reason_text

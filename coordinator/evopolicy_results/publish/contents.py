@@ -29,6 +29,7 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
 from evopolicy_common.errors import DECODE_ERRORS, ProtocolError, raised_as
 from evopolicy_common.messages.bounds import Int, Many, Number, Word
 from evopolicy_common.messages.environment import Split
+from evopolicy_common.messages.episode import RANDOM
 from evopolicy_common.messages.operator import RunResult
 from evopolicy_common.records import journal
 
@@ -50,8 +51,6 @@ MAX_RECORDING_BYTES = 1 << 30
 """Of a group's recordings together, packed."""
 MAX_EPISODE_BYTES = 256 << 20
 """Of one recording, unpacked."""
-RANDOM = -1
-"""Submit index of the random reference."""
 
 
 digest = journal.digest

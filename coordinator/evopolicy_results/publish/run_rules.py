@@ -11,6 +11,7 @@ import msgspec
 
 from evopolicy_common.catalogue import worlds
 from evopolicy_common.errors import ProtocolError
+from evopolicy_common.messages.episode import RANDOM
 from evopolicy_common.messages.operator import RunFinished, RunResult
 from evopolicy_common.messages.run_settings import Line
 from evopolicy_common.records import account, journal
@@ -254,7 +255,7 @@ def _scores(run: PublishedRun, history: History) -> Iterator[str]:
             continue
         returns = tuple(episode.episode_return for episode in group.episodes)
         if split == "heldout":
-            recorded = result.random_heldout_returns if index == contents.RANDOM else result.heldout_returns
+            recorded = result.random_heldout_returns if index == RANDOM else result.heldout_returns
             if returns != recorded:
                 yield f"the returns of {name} are not those of the result"
         else:

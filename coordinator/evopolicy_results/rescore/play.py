@@ -23,7 +23,7 @@ import msgspec
 
 from evopolicy_common.errors import BundleError, ConfigError, ProtocolError, RefusedError
 from evopolicy_common.messages.environment import Case
-from evopolicy_common.messages.episode import EpisodeOutcome
+from evopolicy_common.messages.episode import RANDOM, EpisodeOutcome
 from evopolicy_common.messages.operator import DescribeEnvironment, Rescore
 from evopolicy_common.records.blobs import write_atomically
 from evopolicy_common.records.policies.checkpoints import bundle_of
@@ -39,7 +39,7 @@ from evopolicy_common.records.run_record import RunRecord
 from evopolicy_common.records.splits import FILE_STEMS, cases_hash, folder_of, read_split_file
 from evopolicy_common.records.words import in_words
 from evopolicy_common.refusals import WRONG_SETTINGS, Refusal
-from evopolicy_results.evaluations import RANDOM, Evaluations, unlike
+from evopolicy_results.evaluations import Evaluations, unlike
 from evopolicy_results.reading.comparability import comparable
 from evopolicy_results.reading.records import checkpoint_folder
 

@@ -13,10 +13,11 @@ import msgspec
 
 from evopolicy_common.errors import ConfigError, ProtocolError, raised_as
 from evopolicy_common.messages.environment import Split
+from evopolicy_common.messages.episode import RANDOM
 from evopolicy_common.records.policies.submits import SubmitFiles, read_submits
 from evopolicy_common.records.run_files import RUN_JSON, read_record
 from evopolicy_common.records.run_record import RunRecord
-from evopolicy_results.evaluations import RANDOM, Cases
+from evopolicy_results.evaluations import Cases
 
 _MAX_DIGITS = 9
 

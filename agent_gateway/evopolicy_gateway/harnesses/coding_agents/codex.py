@@ -57,8 +57,8 @@ class Codex(Dialect):
         if self.config.effort is not None:
             words += ["--config", f'model_reasoning_effort="{self.config.effort}"']
         for name, server in self.kept.servers.items():
-            env = ", ".join(f"{_toml(variable)} = {_toml(value)}" for variable, value in server.env.items())
-            settings = {"command": _toml(server.command), "args": _toml(server.args), "env": f"{{{env}}}"}
+            env = ", ".join(f"{toml(variable)} = {toml(value)}" for variable, value in server.env.items())
+            settings = {"command": toml(server.command), "args": toml(server.args), "env": f"{{{env}}}"}
             for key, value in settings.items():
                 words += ["--config", f"mcp_servers.{name}.{key}={value}"]
         if self.relay is not None:
@@ -111,6 +111,6 @@ class CodexReader(TurnReader):
             self.action = f"edits {', '.join(path.rpartition('/')[2] for path in paths)}"
 
 
-def _toml(value: str | tuple[str, ...]) -> str:
+def toml(value: str | tuple[str, ...]) -> str:
     """JSON's strings and lists are TOML's too, except for pairs of escapes (surrogates) and a bare DEL."""
     return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")

@@ -8,6 +8,7 @@ from __future__ import annotations
 from typing import Any, Literal
 
 from evopolicy_common.messages.environment import Case
+from evopolicy_common.messages.episode import RANDOM
 from evopolicy_common.messages.gateway import Conditions
 from evopolicy_common.messages.operator import PlayedAs
 from evopolicy_coordinator.core.contract.records import (
@@ -30,9 +31,6 @@ from evopolicy_coordinator.core.tables.model import (
     Template,
 )
 from evopolicy_coordinator.core.tables.step import Step
-
-RANDOM = -1
-"""Submit index of the random reference."""
 
 HIDDEN_SPLITS = ("validation", "heldout")
 
