@@ -86,7 +86,7 @@ def _in_box(space: SpaceSchema) -> Any:
 _CONSTANT: dict[str, Callable[[SpaceSchema], Any]] = {
     "Discrete": lambda space: int(space.get("start", 0)),
     "Box": _in_box,
-    "Image": lambda space: _box(list(space["shape"]), *space["value_range"], int),
+    "Image": lambda space: _box(space["shape"], space["value_range"][0], space["value_range"][1], int),
     "MultiDiscrete": lambda space: _like(space["nvec"], space.get("start", 0)),
     "MultiBinary": lambda space: _box(
         space["n"] if isinstance(space["n"], list) else [space["n"]], 0, 1, int
