@@ -34,7 +34,6 @@ LARGEST = 1e100
 stay finite."""
 Many = Annotated[tuple[T, ...], Meta(max_length=1 << 20)]
 Named = Annotated[dict[Word, T], Meta(max_length=1 << 16)]
-Numbered = Annotated[dict[Int, T], Meta(max_length=1 << 20)]
 Plain = Annotated[dict[str, Any], Meta(max_length=1 << 16, extra={"plain": True})]
 """Data of JSON's kinds; `check_plain` checks and bounds its content."""
 

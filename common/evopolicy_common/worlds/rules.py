@@ -8,7 +8,7 @@ Rules that this module owns:
 - No change alters a space: a component moves only to a place with the same bounds, turns only about the
   middle of its bounds, and is scaled only if it has none.
 - Each change but that of the parameters can be undone. So a policy for the unchanged environment scores in
-  such a world as it does there, once it knows the rules (`Rules.undo`, `Rules.redo`).
+  such a world as it does there, once it knows the rules (`transformed`).
 - Scales are powers of two and shifts multiples of 1/8: only a shift rounds.
 """
 
@@ -78,11 +78,6 @@ class _Vector(NamedTuple):
         changed = values[self.order] * self.scale + self.shift
         return np.asarray(np.clip(changed, self.low, self.high), values.dtype)
 
-    def undo(self, values: NDArray[Any]) -> NDArray[Any]:
-        undone = np.empty_like(values)
-        undone[self.order] = (values - self.shift) / self.scale
-        return np.asarray(np.clip(undone, self.low, self.high), values.dtype)
-
 
 class Rules:
     """How a world alters what a policy sees and does."""
@@ -112,14 +107,6 @@ class Rules:
     def act(self, action: Any) -> Any:
         """What an action of the policy does: an action of the unchanged environment."""
         return _apply(self.action_change, action)
-
-    def undo(self, obs: Any) -> Any:
-        """The observation of the unchanged environment that the policy sees as `obs`."""
-        return _undo(self.obs_change, obs)
-
-    def redo(self, action: Any) -> Any:
-        """The action that does what `action` does in the unchanged environment."""
-        return _undo(self.action_change, action)
 
     def _change(self, draws: Draws, space: Space, what: str) -> list[int] | _Vector | None:
         ordered, turned, scaled = (
@@ -206,12 +193,6 @@ def _apply(change: list[int] | _Vector | None, value: Any) -> Any:
     if change is None:
         return value
     return change[int(value)] if isinstance(change, list) else change.apply(np.asarray(value))
-
-
-def _undo(change: list[int] | _Vector | None, value: Any) -> Any:
-    if change is None:
-        return value
-    return change.index(int(value)) if isinstance(change, list) else change.undo(np.asarray(value))
 
 
 def _bounds(space: Space) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -37,7 +37,7 @@ class Policy(Unchanged):
             action = np.clip(np.array(action, float).reshape(-1), ACTION[3], ACTION[4])
         return undone(ACTION, action)
 '''
-"""As `Rules.undo` and `Rules.redo`, in a policy's process, which has numpy alone."""
+"""Undoes `Rules.observe` and `Rules.act` in a policy's process, which has numpy alone."""
 
 
 def transformed(bundle: Bundle, rules: Rules) -> Bundle:

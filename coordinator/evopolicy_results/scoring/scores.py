@@ -431,8 +431,3 @@ def paper_text(name: str) -> str:
 def heldout_returns() -> ScoreTable:
     """The paper's table of held-out returns: four agents and the random reference on Core16, one run per cell."""
     return read_score_csv(paper_text("table1_heldout_returns"), source="table1_heldout_returns.csv")
-
-
-def paper_rows(name: str) -> list[dict[str, str]]:
-    """One table of the paper as printed, one dict per row."""
-    return list(csv.DictReader(io.StringIO(paper_text(name))))

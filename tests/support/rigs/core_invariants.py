@@ -68,7 +68,7 @@ def _isolation(state: State) -> None:
     for kernel in state.kernels.values():
         for index in (kernel.permits, kernel.asks, kernel.hidden, kernel.train, kernel.reservations):
             users.update({case_set: len(there) for case_set, there in index.items() if case_set is not None})
-    for case_set in state.case_sets.known_sets():
+    for case_set in state.case_sets._known.values():
         want("", case_set.users == users[case_set], "a case set is kept while it has users")
     for group in state.groups.values():
         run = state.runs.get(group.run)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import math
 
 import pytest
@@ -17,7 +18,7 @@ from evopolicy_results.scoring.scores import (
     heldout_returns,
     leaderboard,
     normalised,
-    paper_rows,
+    paper_text,
     rank_score,
     read_score_csv,
     scale_between,
@@ -34,6 +35,11 @@ def table(scores: dict[str, dict[str, tuple[float | None, ...]]], reference: str
         for env, runs in row.items()
     }
     return ScoreTable(cells=cells, harness=dict.fromkeys(scores, "test"), reference=reference)
+
+
+def paper_rows(name: str) -> list[dict[str, str]]:
+    """One table of the paper as printed, one dict per row."""
+    return list(csv.DictReader(paper_text(name).splitlines()))
 
 
 def test_paper_table_of_returns_gives_its_aggregate_table_to_the_digit() -> None:

@@ -33,6 +33,16 @@ def box(pairs: list[tuple[float, float]], dtype: str = "float64") -> dict[str, A
     return {"type": "Box", "low": low, "high": high, "shape": [len(pairs)], "dtype": dtype}
 
 
+def undone(change: Any, value: Any) -> Any:
+    """What a change of `Rules` was made of."""
+    if change is None or isinstance(change, list):
+        return value if change is None else change.index(int(value))
+    numbers = np.asarray(value)
+    found = np.empty_like(numbers)
+    found[change.order] = (numbers - change.shift) / change.scale
+    return np.asarray(np.clip(found, change.low, change.high), numbers.dtype)
+
+
 def values(pairs: list[tuple[float, float]]) -> np.ndarray[Any, Any]:
     """One value for each place, all different, within the bounds."""
     return np.array(
@@ -52,9 +62,9 @@ def test_the_rules_of_a_world_are_undone_and_keep_the_bounds(
         return
     rules = Rules(key, box(seen), box(done))
     obs, action = values(seen), values(done)
-    shown, asked = rules.observe(obs), rules.redo(action)
+    shown, asked = rules.observe(obs), undone(rules.action_change, action)
     assert 1 <= len(rules.kinds) <= 3
-    np.testing.assert_allclose(rules.undo(shown), obs, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(undone(rules.obs_change, shown), obs, rtol=0, atol=1e-12)
     np.testing.assert_allclose(rules.act(asked), action, rtol=0, atol=1e-12)
     for pairs, found in ((seen, shown), (done, asked)):
         assert all(low <= value <= high for (low, high), value in zip(pairs, found, strict=True))
@@ -68,7 +78,7 @@ def test_a_world_of_choices_is_a_permutation_of_them(key: str, n: int) -> None:
     played = [rules.act(each) for each in range(n)]
     assert sorted(played) == list(range(n))
     assert played != list(range(n))
-    assert [rules.redo(each) for each in played] == list(range(n))
+    assert [undone(rules.action_change, each) for each in played] == list(range(n))
 
 
 def test_the_rules_of_a_key_never_change() -> None:
@@ -104,9 +114,9 @@ def test_a_policy_that_knows_the_rules_scores_as_in_the_unchanged_environment(en
         obs = played.reset(Case(seed=7, options={"world": key} if key else None))
         total, ended = 0.0, False
         while not ended:
-            action = policy.act(obs if rules is None else rules.undo(obs))
+            action = policy.act(obs if rules is None else undone(rules.obs_change, obs))
             repaired, _ = base.action_codec.repair(action)
-            step = played.step(repaired if rules is None else rules.redo(repaired))
+            step = played.step(repaired if rules is None else undone(rules.action_change, repaired))
             obs, total, ended = step.obs, total + step.reward, step.terminated or step.truncated
         returns[key] = total
     assert len(set(returns.values())) == 1, returns

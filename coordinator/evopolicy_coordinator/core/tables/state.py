@@ -191,9 +191,6 @@ class CaseSets:
         case_set.users += 1
         return case_set
 
-    def known_sets(self) -> Iterable[CaseSet]:
-        return self._known.values()
-
     def leave(self, case_set: CaseSet | None) -> None:
         """Remove one user of a case set; the last one removes the case set."""
         if case_set is None:
