@@ -18,13 +18,14 @@ def page(handler: Any, _: dict[str, Any]) -> None:
     handler._send(200, PAGE, "text/html")
 
 
-def garbage(body: bytes, kind: str = "text/event-stream") -> Odd:
-    """Any bytes with status 200."""
+def garbage(body: bytes, kind: str = "text/event-stream", status: int = 200) -> Odd:
+    """Any bytes."""
+    return lambda handler, _: handler._send(status, body, kind)
 
-    def answer(handler: Any, _: dict[str, Any]) -> None:
-        handler._send(200, body, kind)
 
-    return answer
+def answers(status: int, document: Any) -> Odd:
+    """A document, which need be none of the API's."""
+    return garbage(json.dumps(document).encode(), "application/json", status)
 
 
 def busy(status: int = 429, **headers: str) -> Odd:

@@ -22,6 +22,13 @@ FRESH, CACHED, OUTPUT = 300, 700, 20
 """Tokens that every answer claims: input without the cached ones, cached input, output."""
 
 
+def conversation_settings(base_url: str, api: str = "chat", **more: Any) -> dict[str, Any]:
+    """What a `Conversation` with a model on that server is begun with."""
+    settings: dict[str, Any] = {"api": api, "provider": "compatible", "model": "m-1", "base_url": base_url}
+    settings |= {"effort": None, "system": "", "parameters": {}, "retries": 0, "timeout_s": 9.0}
+    return settings | {"context_tokens": 1000, "max_output_tokens": 9} | more
+
+
 @dataclass(frozen=True)
 class Said:
     """One answer of the model."""

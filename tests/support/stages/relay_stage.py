@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncIterator, Awaitable, Callable
+from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import Any
@@ -62,52 +62,37 @@ class Served:
 
 @asynccontextmanager
 async def relay(
-    tmp_path: Path, api: ModelApi, protocol: Protocol = "openai", **more: Any
+    tmp_path: Path, script: list[Step], protocol: Protocol = "openai", **more: Any
 ) -> AsyncIterator[Served]:
-    served = Served(tmp_path / "ledger.jsonl", api)
-    base = f"{api.base_url}/v1" if protocol == "openai" else api.base_url
-    given = {"base_url": base, "key": KEY, **more.pop("upstream", {})}
-    upstream = Upstream(protocol=protocol, **given)
-    order = Order(upstream=upstream, token=TOKEN, ledger=str(served.ledger), **more)
-    app = Relay(
-        order, counted=lambda: None, note=served.notes.append, spent=served.spent.append, now=lambda: NOON
-    )
-    sock = bound("127.0.0.1", 0)
-    served.port = sock.getsockname()[1]
-    async with serving(app, sock):
-        headers = {"authorization": f"Bearer {TOKEN}"}
-        url = f"http://127.0.0.1:{served.port}"
-        async with httpx.AsyncClient(
-            base_url=url, headers=headers, trust_env=False, timeout=60.0
-        ) as served.client:
-            yield served
-    await app.close()
+    """A relay to an API that plays the script; `more`: of its order."""
+    with ModelApi(script) as api:
+        served = Served(tmp_path / "ledger.jsonl", api)
+        base = f"{api.base_url}/v1" if protocol == "openai" else api.base_url
+        given = {"base_url": base, "key": KEY, **more.pop("upstream", {})}
+        upstream = Upstream(protocol=protocol, **given)
+        order = Order(upstream=upstream, token=TOKEN, ledger=str(served.ledger), **more)
+        app = Relay(
+            order, counted=lambda: None, note=served.notes.append, spent=served.spent.append, now=lambda: NOON
+        )
+        sock = bound("127.0.0.1", 0)
+        served.port = sock.getsockname()[1]
+        async with serving(app, sock):
+            headers = {"authorization": f"Bearer {TOKEN}"}
+            url = f"http://127.0.0.1:{served.port}"
+            async with httpx.AsyncClient(
+                base_url=url, headers=headers, trust_env=False, timeout=60.0
+            ) as served.client:
+                yield served
+        await app.close()
 
 
 def asked(
     tmp_path: Path, script: list[Step], *bodies: dict[str, Any], path: str = "chat/completions", **more: Any
 ) -> tuple[list[httpx.Response], Served]:
-    """The relay's answers to requests one after another, with a relay as of `played`."""
-    answers: list[httpx.Response] = []
+    """The relay's answers to requests one after another, and the relay, which has ended."""
 
-    async def act(served: Served) -> None:
-        for body in bodies:
-            answers.append(await served.ask(path, **body))
+    async def ask() -> tuple[list[httpx.Response], Served]:
+        async with relay(tmp_path, script, **{"protocol": PATHS.get(path, "openai"), **more}) as served:
+            return [await served.ask(path, **body) for body in bodies], served
 
-    return answers, played(tmp_path, script, act, **{"protocol": PATHS.get(path, "openai"), **more})
-
-
-def played(
-    tmp_path: Path, script: list[Step], act: Callable[[Served], Awaitable[Any]], **more: Any
-) -> Served:
-    """Does `act` with a relay to an API that plays the script."""
-    found: list[Served] = []
-
-    async def main() -> None:
-        async with relay(tmp_path, api, **more) as served:
-            found.append(served)
-            await act(served)
-
-    with ModelApi(script) as api:
-        asyncio.run(main())
-    return found[0]
+    return asyncio.run(ask())

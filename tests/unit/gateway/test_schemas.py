@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 import json
-import subprocess
 import sys
 import tomllib
 from collections.abc import Iterator
@@ -16,6 +15,7 @@ import pytest
 from invented.policies import Version
 from invented.run_dirs import write_run
 from jsonschema import Draft202012Validator
+from program_runs import run_program
 
 from evopolicy_common.records.suite_folder import Index, SweepRun
 from evopolicy_gateway.cli import files
@@ -34,13 +34,8 @@ def problems(name: str, value: Any) -> list[str]:
 def written(folder: Path) -> dict[str, Any]:
     """One file of each JSON kind, as evopolicy writes it, by its name."""
     run = write_run(folder / "runs", [Version({"policy.py": "x = 1"}, (1.0, 2.0), 1.5)])
-    save(
-        folder,
-        Index(
-            suite="s",
-            runs={"a": SweepRun(name="a", agent="codex", env="gym/acrobot", repeat=0, digest="0" * 64)},
-        ),
-    )
+    entry = SweepRun(name="a", agent="codex", env="gym/acrobot", repeat=0, digest="0" * 64)
+    save(folder, Index(suite="s", runs={"a": entry}))
     return {
         "run.json": json.loads((run / "run.json").read_bytes()),
         "summary.json": json.loads(next(run.glob("**/summary.json")).read_bytes()),
@@ -63,11 +58,8 @@ def test_written_files_are_valid(tmp_path: Path) -> None:
 def test_a_file_of_wrong_types_is_not_valid(tmp_path: Path) -> None:
     for name, value in written(tmp_path).items():
         for field, one in value.items():
-            if one is not None:
-                assert problems(name, value | {field: [[]] if not isinstance(one, list) else 5}), (
-                    name,
-                    field,
-                )
+            wrong = 5 if isinstance(one, list) else [[]]
+            assert one is None or problems(name, value | {field: wrong}), (name, field)
 
 
 @pytest.mark.parametrize(
@@ -107,11 +99,9 @@ def test_fields_have_the_words_of_their_docstrings() -> None:
 
 
 def test_the_command_prints_a_schema_and_refuses_other_names() -> None:
-    evopolicy = str(Path(sys.executable).with_name("evopolicy"))
-    done = subprocess.run(
-        [evopolicy, "files", "schemas/run.json.schema.json"], capture_output=True, text=True, check=True
-    )
+    evopolicy = Path(sys.executable).with_name("evopolicy")
+    done = run_program(evopolicy, "files", "schemas/run.json.schema.json")
     assert json.loads(done.stdout) == json.loads(msgspec.json.encode(files.schema("run.json")))
-    wrong = subprocess.run([evopolicy, "files", "schemas/runs"], capture_output=True, text=True, check=False)
+    wrong = run_program(evopolicy, "files", "schemas/runs")
     assert wrong.returncode == 2
     assert "no file 'schemas/runs'" in wrong.stderr

@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 from invented.policies import Version
 from invented.run_dirs import write_run
+from program_runs import put_program
 from starlette.testclient import TestClient
 
 from evopolicy_common.errors import ConfigError
@@ -58,9 +59,8 @@ def test_a_task_is_private_and_its_agent_cannot_ask_for_the_score(tmp_path: Path
     assert task["environment"]["env"] == {"EVOPOLICYGYM_TOKEN": "b" * 64}
     # Harbor stops the agent's container before it starts another for the verifier.
     assert task["verifier"]["environment_mode"] == "separate"
-    volumes = json.loads((place / "environment/docker-compose.yaml").read_text())["services"]["main"][
-        "volumes"
-    ]
+    services = json.loads((place / "environment/docker-compose.yaml").read_text())["services"]
+    volumes = services["main"]["volumes"]
     assert [(each["source"], each["target"], each["read_only"]) for each in volumes] == [
         (str(folder.workspace), "/work", False),
         (str(folder.workspace / "feedback"), "/work/feedback", True),
@@ -101,12 +101,10 @@ def test_any_path_of_a_run_is_read_from_its_task_again(tmp_path: Path) -> None:
 def test_a_verifier_waits_for_a_service_that_is_busy(tmp_path: Path) -> None:
     test = write_task(tmp_path / "tasks", open_run(tmp_path).root, URL, 60.0) / "tests" / "test.sh"
     programs = tmp_path / "programs"
-    programs.mkdir()
     answers = tmp_path / "answers"
     answers.write_text("000\n503\n202\n409\n")
     for name, text in {"curl": f"sed -n 1p {answers}; sed -i 1d {answers}", "sleep": ":", "cat": ":"}.items():
-        (programs / name).write_text(f"#!/bin/sh\n{text}\n")
-        (programs / name).chmod(0o700)
+        put_program(programs / name, text)
     path = f"{programs}:{os.environ['PATH']}"
     done = subprocess.run(["sh", test], env={"PATH": path}, timeout=60, check=False)
     assert (done.returncode, answers.read_text()) == (1, "")

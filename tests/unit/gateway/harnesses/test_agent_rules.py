@@ -12,6 +12,7 @@ import msgspec
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from program_runs import put_program
 from stages.cli_stage import FAKES, play, settings
 
 from evopolicy_common.errors import ConfigError
@@ -229,10 +230,7 @@ emit({"usage": {"in": 10, "cached": 4, "out": 2}})
 
 def fake(tmp_path: Path, code: str) -> tuple[str, ...]:
     """A CLI, as the agent's program."""
-    program = tmp_path / "fake-cli"
-    program.write_text(FAKE + code)
-    program.chmod(0o755)
-    return (str(program),)
+    return (str(put_program(tmp_path / "fake-cli", FAKE + code)),)
 
 
 def test_a_cli_without_a_harness_is_described_in_a_file(tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ import pytest
 from stages import odd_answers
 from stages.cli_stage import Played, play, settings
 from stages.model_api import SUBMIT, ModelApi, Step
-from stages.provider_api import CACHED, FRESH, OUTPUT, ProviderApi, Said
+from stages.provider_api import CACHED, FRESH, OUTPUT, ProviderApi, Said, conversation_settings
 
 from evopolicy_common.errors import ConfigError
 from evopolicy_gateway import harnesses
@@ -90,16 +90,6 @@ def test_a_wrong_key_ends_the_run_with_the_providers_words(tmp_path: Path, api: 
     assert "no such key" in run.ending.detail
 
 
-KNOWN: dict[str, Any] = {
-    "provider": "compatible",
-    "model": "m-1",
-    "effort": None,
-    "system": "",
-    "parameters": {},
-}
-KNOWN |= {"retries": 0, "timeout_s": 9.0, "context_tokens": 1000, "max_output_tokens": 9}
-
-
 @apis
 @pytest.mark.parametrize("kind", ["text/event-stream", "application/json", "text/html"])
 @pytest.mark.parametrize(
@@ -108,7 +98,7 @@ KNOWN |= {"retries": 0, "timeout_s": 9.0, "context_tokens": 1000, "max_output_to
 async def test_an_answer_of_another_form_is_an_error_that_says_so(api: ApiName, body: str, kind: str) -> None:
     data = f"data: {body}\n\n" if "event" in kind else body
     with ModelApi([Step(odd=odd_answers.garbage(data.encode(), kind))] * 2) as server:
-        known = Conversation({"api": api, "base_url": server.base_url, **KNOWN}, "")
+        known = Conversation(conversation_settings(server.base_url, api), "")
         known.say("hello")
         with pytest.raises(ApiError, match="cannot be read"):
             await known.ask_model()
@@ -149,7 +139,7 @@ def test_a_conversation_beyond_the_models_context_goes_on_without_old_outputs(
 async def test_providers_words_for_a_conversation_that_is_too_long_are_known(text: str) -> None:
     for status in (400, 500):
         with ModelApi([Step(status=status, text=text)] * 2) as server:
-            known = Conversation({"api": "messages", "base_url": server.base_url, **KNOWN}, "")
+            known = Conversation(conversation_settings(server.base_url, "messages"), "")
             known.say("hello")
             with pytest.raises(ApiError, match=re.escape(text)) as raised:
                 await known.ask_model()
@@ -157,7 +147,7 @@ async def test_providers_words_for_a_conversation_that_is_too_long_are_known(tex
 
 
 def test_shortening_goes_on_until_two_outputs_are_left() -> None:
-    known = Conversation({"api": "chat", "base_url": "http://127.0.0.1:1", **KNOWN}, "")
+    known = Conversation(conversation_settings("http://127.0.0.1:1"), "")
     for n in range(12):
         known.answer([Call(id=str(n))], [f"output {n}"])
     kept = []
@@ -250,9 +240,8 @@ def test_plain_http_reaches_the_local_network_only_where_it_is_allowed(
     found = {name: [(0, 0, 0, "", (each, 0)) for each in addresses] for name, addresses in known.items()}
     monkeypatch.setattr(socket, "getaddrinfo", lambda host, *more, **options: found[host])
     for insecure, expected in ((False, allowed), (True, with_insecure)):
-        config = AgentConfig(
-            harness="llm", model="m", api=ApiTable(base_url=url, insecure_http=insecure, key="")
-        )
+        table = ApiTable(base_url=url, insecure_http=insecure, key="")
+        config = AgentConfig(harness="llm", model="m", api=table)
         if expected:
             config.check()
         else:

@@ -19,6 +19,7 @@ from stages.provider_api import (
     Sends,
     chat_chunk,
     chat_usage,
+    conversation_settings,
 )
 
 from evopolicy_gateway.agents.llm.agent import Events, Session, play_turn
@@ -42,25 +43,9 @@ SPENT = {
 }
 
 
-def known_settings(server: ProviderApi, api: str) -> dict[str, Any]:
-    settings: dict[str, Any] = {"api": api, "provider": "compatible", "model": "m-1", "system": ""}
-    settings |= {"base_url": server.base_url, "variable": "KEY", "effort": None, "parameters": {}}
-    return settings | {"retries": 0, "timeout_s": 9.0, "context_tokens": 10**6, "max_output_tokens": 9}
-
-
-async def conversed(
-    server: ProviderApi, api: str, n: int, provider: str = "compatible", **more: Any
-) -> list[Reply]:
+async def conversed(server: ProviderApi, api: str, n: int, **more: Any) -> list[Reply]:
     """The replies of a conversation that is begun anew from what was kept before each request."""
-    settings: dict[str, Any] = {"api": api, "provider": provider, "model": "m-1", "system": ""}
-    settings |= {
-        "base_url": server.base_url,
-        "effort": None,
-        "parameters": {},
-        "retries": 0,
-        "timeout_s": 9.0,
-    }
-    settings |= {"context_tokens": 1000, "max_output_tokens": 9, **more}
+    settings = conversation_settings(server.base_url, api, **more)
     replies, kept, outputs = [], b"", 0
     for _ in range(n):
         conversation = Conversation(settings, "key", kept)
@@ -73,6 +58,10 @@ async def conversed(
         replies.append(reply)
         kept = conversation.dumped()
     return replies
+
+
+def fault(message: str, **more: Any) -> Document:
+    return {"error": {"message": message} | more}
 
 
 def said(replies: list[Reply]) -> list[tuple[str, tuple[str, ...]]]:
@@ -96,7 +85,7 @@ async def test_a_providers_messages_come_back_unchanged_after_each_restart(api: 
 async def test_each_provider_by_its_name(provider: ProviderName) -> None:
     api = PROVIDERS[provider].api
     with ProviderApi("openrouter" if provider == "openrouter" else api, SCRIPT) as server:
-        assert said(await conversed(server, api, 4, provider, model="maker/m-1")) == WHOLE
+        assert said(await conversed(server, api, 4, provider=provider, model="maker/m-1")) == WHOLE
 
 
 @apis
@@ -149,13 +138,8 @@ def streaming(chunks: Calls) -> Sends:
             return False
         message = provider.took(said)
         texts = {name: message[name] for name in ("content", "reasoning_content") if message.get(name)}
-        usage = {
-            "id": "c",
-            "object": "chat.completion.chunk",
-            "created": 1,
-            "choices": [],
-            "usage": chat_usage(),
-        }
+        usage = {"id": "c", "object": "chat.completion.chunk", "created": 1, "choices": []}
+        usage["usage"] = chat_usage()
         calls = chunks(message["tool_calls"])
         handler.stream(iter([chat_chunk(texts), *calls, chat_chunk({}, "tool_calls"), usage]))
         return True
@@ -183,10 +167,6 @@ def changing(change: Callable[[Document], Any], *, ids: bool = True) -> Sends:
     return sends
 
 
-def as_object(call: Document) -> None:
-    call["function"]["arguments"] = json.loads(call["function"]["arguments"])
-
-
 @pytest.mark.parametrize(
     ("sends", "n_more"),
     [
@@ -197,7 +177,12 @@ def as_object(call: Document) -> None:
         (changing(lambda call: call["function"].update(name=None)), 1),
         (changing(lambda call: call.update(id=None), ids=False), 0),
         (changing(lambda call: None, ids=False), 0),
-        (changing(as_object), 0),
+        (
+            changing(
+                lambda call: call["function"].update(arguments=json.loads(call["function"]["arguments"]))
+            ),
+            0,
+        ),
     ],
     ids=["one index", "no index", "nulls", "no name", "null as name", "null as id", "no id", "object"],
 )
@@ -210,17 +195,14 @@ async def test_calls_in_another_form_are_understood(sends: Sends, n_more: int) -
 
 def refusing_stream_options(request: Document) -> tuple[Any, ...] | None:
     """As Mistral and others whose schema is closed."""
-    fault = {
-        "type": "extra_forbidden",
-        "loc": ["body", "stream_options"],
-        "msg": "Extra inputs are not permitted",
-    }
-    return (422, {"detail": [fault]}) if "stream_options" in request else None
+    detail = {"type": "extra_forbidden", "loc": ["body", "stream_options"]}
+    detail["msg"] = "Extra inputs are not permitted"
+    return (422, {"detail": [detail]}) if "stream_options" in request else None
 
 
 async def test_a_refused_option_of_streams_is_left_out() -> None:
     with ProviderApi("chat", SCRIPT, refuses=refusing_stream_options) as server:
-        assert said(await conversed(server, "chat", 4, "mistral")) == WHOLE
+        assert said(await conversed(server, "chat", 4, provider="mistral")) == WHOLE
     assert len(server.requests) == 5
 
 
@@ -228,19 +210,18 @@ def without_reasoning_in_chat(request: Document) -> tuple[Any, ...] | None:
     """As OpenAI's newest models: tools and reasoning together only in Responses."""
     if "messages" in request and request.get("reasoning_effort") != "none":
         words = "Function tools with reasoning are not supported in /v1/chat/completions. Use /v1/responses."
-        return 400, {"error": {"message": words, "type": "invalid_request_error", "code": None}}
+        return 400, fault(words, type="invalid_request_error", code=None)
     return None
 
 
 async def test_openais_models_reason_with_tools_over_responses() -> None:
     with ProviderApi("responses", SCRIPT, refuses=without_reasoning_in_chat) as server:
-        assert said(await conversed(server, PROVIDERS["openai"].api, 4, "openai", effort="high")) == WHOLE
-    assert server.requests[0]["reasoning"]["effort"] == "high"
+        api = PROVIDERS["openai"].api
+        assert said(await conversed(server, api, 4, provider="openai", effort="high")) == WHOLE
+    first = server.requests[0]
+    assert first["reasoning"]["effort"] == "high"
     # Nothing is kept at the provider: reasoning comes and goes encrypted.
-    assert (server.requests[0]["store"], server.requests[0]["include"]) == (
-        False,
-        ["reasoning.encrypted_content"],
-    )
+    assert (first["store"], first["include"]) == (False, ["reasoning.encrypted_content"])
 
 
 @pytest.mark.parametrize(
@@ -265,7 +246,7 @@ async def test_effort_and_further_parameters_are_in_each_request(
 
 @pytest.mark.parametrize("streamed", [True, False])
 async def test_an_error_in_a_success_is_told_in_the_servers_words(streamed: bool) -> None:
-    error = {"error": {"message": "the backend fell over", "code": 502}}
+    error = fault("the backend fell over", code=502)
 
     def sends(provider: ProviderApi, handler: Any, request: Document, said: Said) -> bool:
         if streamed:
@@ -283,52 +264,44 @@ async def test_an_error_in_a_success_is_told_in_the_servers_words(streamed: bool
 
 async def test_the_words_in_a_list_of_errors_are_told() -> None:
     words = "Function call is missing a thought_signature"
-    error = [{"error": {"code": 400, "message": words, "status": "INVALID_ARGUMENT"}}]
+    error = [fault(words, code=400, status="INVALID_ARGUMENT")]
     known = pytest.raises(ApiError, match=f"^{words}$")
     with ProviderApi("chat", SCRIPT, refuses=lambda request: (400, error)) as server, known as raised:
         await conversed(server, "chat", 1)
     assert raised.value.status == 400
 
 
+NO_KEY = {"@type": "type.googleapis.com/google.rpc.ErrorInfo", "reason": "API_KEY_INVALID"}
 ERRORS: list[tuple[ApiName, int, Any, str]] = [
     (
         "chat",
         429,
-        {"error": {"message": "You exceeded your current quota.", "code": "insufficient_quota", "type": "x"}},
+        fault("You exceeded your current quota.", code="insufficient_quota", type="x"),
         "^quota exceeded: You exceeded your current quota",
     ),
-    ("chat", 402, {"error": {"message": "Insufficient Balance"}}, "^quota exceeded: Insufficient Balance"),
+    ("chat", 402, fault("Insufficient Balance"), "^quota exceeded: Insufficient Balance"),
     (
         "messages",
         401,
-        {"type": "error", "error": {"type": "authentication_error", "message": "invalid x-api-key"}},
+        {"type": "error"} | fault("invalid x-api-key", type="authentication_error"),
         "^the provider does not accept the key in THE_KEY: invalid x-api-key",
     ),
     (
         "gemini",
         400,
-        {
-            "error": {
-                "code": 400,
-                "message": "API key not valid.",
-                "status": "INVALID_ARGUMENT",
-                "details": [
-                    {"@type": "type.googleapis.com/google.rpc.ErrorInfo", "reason": "API_KEY_INVALID"}
-                ],
-            }
-        },
+        fault("API key not valid.", code=400, status="INVALID_ARGUMENT", details=[NO_KEY]),
         "^the provider does not accept the key in THE_KEY: API key not valid",
     ),
     (
         "chat",
         404,
-        {"error": {"message": "The model does not exist", "code": "model_not_found"}},
+        fault("The model does not exist", code="model_not_found"),
         "^there is no model m-1 for this key: The model does not exist; the server lists m-2, other$",
     ),
     (
         "responses",
         400,
-        {"error": {"message": "Your input exceeds the context window", "code": "context_length_exceeded"}},
+        fault("Your input exceeds the context window", code="context_length_exceeded"),
         "longer than the model's context, set context_tokens below it: Your input exceeds",
     ),
     (
@@ -337,7 +310,7 @@ ERRORS: list[tuple[ApiName, int, Any, str]] = [
         {"object": "error", "message": '"auto" tool choice requires --enable-auto-tool-choice', "code": 400},
         "takes no tools, which the agent needs: .*--enable-auto-tool-choice",
     ),
-    ("chat", 404, {"error": {"message": "No endpoints found that support tool use."}}, "takes no tools"),
+    ("chat", 404, fault("No endpoints found that support tool use."), "takes no tools"),
 ]
 
 
@@ -355,7 +328,7 @@ async def test_errors_say_what_is_wrong_in_the_users_words(
 
 @pytest.mark.parametrize(("stated", "wait_s"), [("2", None), ("3600", 3600.0)])
 async def test_only_a_long_stated_wait_counts_for_a_spent_quota(stated: str, wait_s: float | None) -> None:
-    error = {"error": {"message": "You exceeded your current quota.", "code": "insufficient_quota"}}
+    error = fault("You exceeded your current quota.", code="insufficient_quota")
     headers = {"retry_after": stated, "x_should_retry": "false"}
     with (
         ProviderApi("chat", SCRIPT, refuses=lambda request: (429, error, headers)) as server,
@@ -365,26 +338,15 @@ async def test_only_a_long_stated_wait_counts_for_a_spent_quota(stated: str, wai
     assert raised.value.retry_after_s == wait_s
 
 
-class Heard:
-    """Events of a turn."""
-
-    def __init__(self) -> None:
-        self.out = io.StringIO()
-        self.events = Events(self.out, "s")
-
-    @property
-    def lines(self) -> list[Document]:
-        return [json.loads(line) for line in self.out.getvalue().splitlines()]
-
-
 async def turn(
     tmp_path: Path, script: list[Said], api: str = "chat"
 ) -> tuple[int, list[Document], ProviderApi]:
-    heard = Heard()
+    out = io.StringIO()
     with ProviderApi(api, script) as server:
-        conversation = Conversation(known_settings(server, api), "key")
-        status = await play_turn(conversation, "Go on.", Session(tmp_path / "s.json"), heard.events)
-    return status, heard.lines, server
+        settings = conversation_settings(server.base_url, api, variable="KEY", context_tokens=10**6)
+        session = Session(tmp_path / "s.json")
+        status = await play_turn(Conversation(settings, "key"), "Go on.", session, Events(out, "s"))
+    return status, [json.loads(line) for line in out.getvalue().splitlines()], server
 
 
 CUT = {"chat": "length", "responses": "max_output_tokens", "messages": "max_tokens", "gemini": "MAX_TOKENS"}

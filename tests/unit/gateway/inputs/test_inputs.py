@@ -9,11 +9,11 @@ import shutil
 import tomllib
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import msgspec
 import pytest
 from stages.declared_inputs import DESCRIPTION, declare
+from stages.provider_api import conversation_settings
 
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.records.run_record import inputs_digest
@@ -234,17 +234,7 @@ def test_the_built_in_agent_tells_its_model_when_to_read_a_skill(tmp_path: Path)
     Conversation = pytest.importorskip("evopolicy_gateway.agents.llm.conversation").Conversation  # noqa: N806
     declare(tmp_path)
     path = str(tmp_path / "skills/lamps/SKILL.md")
-    settings: dict[str, Any] = {
-        "provider": "openai",
-        "api": "responses",
-        "effort": None,
-        "model": "m",
-        "base_url": "",
-        "system": "",
-        "skills": [path],
-    }
-    settings |= {"parameters": {}, "max_output_tokens": 10, "context_tokens": 1000, "retries": 0}
-    settings["timeout_s"] = 1.0
+    settings = conversation_settings("", "responses", provider="openai", skills=[path])
     system = Conversation(settings, "key")._system
     assert path in system
     assert DESCRIPTION in system

@@ -40,22 +40,17 @@ def test_settings_and_login_are_copied_and_sessions_are_not(home: Path, tmp_path
     assert (home / ".codex" / "config.toml").read_text() == "model = 'mine'"
 
 
-def test_nothing_is_written_over_a_link_that_the_agent_left(home: Path, tmp_path: Path) -> None:
-    copy(places(True, "codex"), tmp_path / "run")
+@pytest.mark.parametrize("given_first", [True, False])
+def test_nothing_is_written_over_a_link_that_the_agent_left(
+    home: Path, tmp_path: Path, given_first: bool
+) -> None:
+    """Also where the operator gave the login only when the run was resumed."""
+    copy(places(given_first, "codex"), tmp_path / "run")
     own, target = tmp_path / "run" / "home" / ".codex", tmp_path / "operators"
     target.mkdir()
-    own.rename(own.with_name("gone"))
+    if given_first:
+        own.rename(own.with_name("gone"))
     own.symlink_to(target)
-    copy(places(True, "codex"), tmp_path / "run")
-    assert list(target.iterdir()) == []
-
-
-def test_nothing_is_written_over_an_agents_link(home: Path, tmp_path: Path) -> None:
-    """The operator gave the login only when the run was resumed."""
-    copy((), tmp_path / "run")
-    target = tmp_path / "operators"
-    target.mkdir()
-    (tmp_path / "run" / "home" / ".codex").symlink_to(target)
     copy(places(True, "codex"), tmp_path / "run")
     assert list(target.iterdir()) == []
 

@@ -50,9 +50,9 @@ async def ask(
         (f"CONNECT example.org:{'4' * 5000} HTTP/1.1", b"403"),
     ],
 )
-def test_anything_but_a_named_host_and_port_is_refused(request_line: str, status: bytes) -> None:
+async def test_anything_but_a_named_host_and_port_is_refused(request_line: str, status: bytes) -> None:
     hosts = frozenset({("example.org", 443)})
-    answer = asyncio.run(ask(request_line.encode() + b"\r\n\r\n", hosts))
+    answer = await ask(request_line.encode() + b"\r\n\r\n", hosts)
     assert answer.split()[1] == status
 
 
@@ -67,35 +67,34 @@ def test_a_forbidden_host_is_logged_once(monkeypatch: pytest.MonkeyPatch) -> Non
     assert len(logged) == len(set(logged)) == proxy.MAX_DENIED_LOGGED
 
 
-def test_a_named_host_gets_the_bytes_and_answers() -> None:
-    async def main() -> bytes:
-        async def shout(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-            writer.write((await reader.read()).upper())
-            await writer.drain()
-            writer.close()
+async def test_a_named_host_gets_the_bytes_and_answers() -> None:
+    async def shout(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        writer.write((await reader.read()).upper())
+        await writer.drain()
+        writer.close()
 
-        server = await asyncio.start_server(shout, "127.0.0.1", 0)
-        port = server.sockets[0].getsockname()[1]
-        async with server:
-            request = f"CONNECT LocalHost:{port} HTTP/1.1\r\nhost: x\r\n\r\n".encode()
-            return await ask(request, frozenset({("localhost", port)}), then=b"psst")
-
-    answer = asyncio.run(main())
+    server = await asyncio.start_server(shout, "127.0.0.1", 0)
+    port = server.sockets[0].getsockname()[1]
+    async with server:
+        request = f"CONNECT LocalHost:{port} HTTP/1.1\r\nhost: x\r\n\r\n".encode()
+        answer = await ask(request, frozenset({("localhost", port)}), then=b"psst")
     assert answer.startswith(b"HTTP/1.1 200")
     assert answer.endswith(b"\r\n\r\nPSST")
 
 
-def test_a_named_host_that_is_away_is_reported() -> None:
+async def test_a_named_host_that_is_away_is_reported() -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
-    answer = asyncio.run(
-        ask(f"CONNECT localhost:{port} HTTP/1.1\r\n\r\n".encode(), frozenset({("localhost", port)}))
-    )
-    assert answer.split()[1] == b"502"
+    request = f"CONNECT localhost:{port} HTTP/1.1\r\n\r\n".encode()
+    assert (await ask(request, frozenset({("localhost", port)}))).split()[1] == b"502"
 
 
-def test_a_head_without_end_is_cut() -> None:
-    assert asyncio.run(ask(b"x" * 100_000)) == b""
+@pytest.mark.parametrize("sent", [b"x" * 100_000, b""], ids=["without end", "nothing"])
+async def test_a_program_that_sends_no_head_is_hung_up_on(
+    sent: bytes, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(proxy, "_HEAD_TIMEOUT_S", 0.2 if sent == b"" else 30.0)
+    assert await ask(sent, ends=sent != b"") == b""
 
 
 async def test_a_program_that_ended_before_it_passed_its_sockets_opens_no_listener() -> None:
@@ -107,12 +106,7 @@ async def test_a_program_that_ended_before_it_passed_its_sockets_opens_no_listen
     here.close()
 
 
-def test_a_jailed_program_that_asks_for_nothing_is_hung_up_on(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(proxy, "_HEAD_TIMEOUT_S", 0.2)
-    assert asyncio.run(ask(b"", ends=False)) == b""
-
-
-def test_a_named_host_that_does_not_answer_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_a_named_host_that_does_not_answer_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(proxy, "_CONNECT_TIMEOUT_S", 0.2)
     connect = asyncio.open_connection
 
@@ -123,5 +117,4 @@ def test_a_named_host_that_does_not_answer_is_reported(monkeypatch: pytest.Monke
 
     monkeypatch.setattr(asyncio, "open_connection", to_nowhere)
     request = b"CONNECT example.org:443 HTTP/1.1\r\n\r\n"
-    answer = asyncio.run(ask(request, frozenset({("example.org", 443)})))
-    assert answer.split()[1] == b"502"
+    assert (await ask(request, frozenset({("example.org", 443)}))).split()[1] == b"502"

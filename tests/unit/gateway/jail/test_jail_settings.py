@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from program_runs import put_program
 
 from evopolicy_common.errors import ConfigError
 from evopolicy_gateway.jail.settings import HTTPS, JailSettings, check_bubblewrap, host
@@ -65,20 +66,15 @@ def test_a_machine_without_bubblewrap_gets_a_remedy(tmp_path: Path, monkeypatch:
 
 
 def test_a_bubblewrap_that_fails_is_quoted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    program = tmp_path / "bwrap"
-    program.write_text("#!/bin/sh\necho no namespaces for you >&2\nexit 1\n")
-    program.chmod(0o755)
+    put_program(tmp_path / "bwrap", "echo no namespaces for you >&2\nexit 1")
     monkeypatch.setenv("PATH", str(tmp_path))
     with pytest.raises(ConfigError, match=r"no namespaces for you.*--jail none"):
         check_bubblewrap()
 
 
 def test_ctrl_c_does_not_reach_a_tried_bubblewrap(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    program = tmp_path / "bwrap"
-    program.write_text(
-        '#!/bin/sh\nread -r pid name state parent group rest < /proc/$$/stat\n[ "$group" = $$ ]\n'
-    )
-    program.chmod(0o755)
+    text = 'read -r pid name state parent group rest < /proc/$$/stat\n[ "$group" = $$ ]'
+    put_program(tmp_path / "bwrap", text)
     monkeypatch.setenv("PATH", str(tmp_path))
     check_bubblewrap()
 

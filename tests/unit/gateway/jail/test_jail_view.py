@@ -7,41 +7,27 @@ Attacks, each with its defence:
 
 from __future__ import annotations
 
-import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+from program_runs import put_program, run_program
 
 from evopolicy_gateway.jail.installs import hidden_below, needs_of
 from evopolicy_gateway.jail.view import View
 
 
-def program(path: Path, first_line: str = "#!/bin/sh") -> Path:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(first_line + "\n")
-    path.chmod(0o755)
-    return path
+def arguments(tmp_path: Path, **fields: object) -> list[str]:
+    return view(tmp_path, **fields).arguments()
 
 
-def arguments(tmp_path: Path, command: list[str], **fields: object) -> list[str]:
-    return view(tmp_path, command, **fields).arguments()
-
-
-def view(tmp_path: Path, command: list[str], **fields: object) -> View:
+def view(tmp_path: Path, command: tuple[str, ...] = (), **fields: object) -> View:
     workspace = tmp_path / "runs" / "w"
     (workspace / "feedback").mkdir(parents=True)
     (workspace / "AGENTS.md").touch()
-    usual: dict[str, object] = {
-        "workspace": workspace,
-        "private": tmp_path / "private",
-        "home": "/home/somebody",
-        "needs": needs_of(command, None),
-        "read": (),
-        "write": (),
-        "hidden": (tmp_path / "runs",),
-        "open_network": False,
-    }
+    usual: dict[str, object] = {"workspace": workspace, "private": tmp_path / "private"}
+    usual |= {"home": "/home/somebody", "needs": needs_of(command, None), "read": (), "write": ()}
+    usual |= {"hidden": (tmp_path / "runs",), "open_network": False}
     return View(**(usual | fields))  # type: ignore[arg-type]
 
 
@@ -50,11 +36,10 @@ def triples(words: list[str], option: str) -> list[tuple[str, str]]:
 
 
 def test_a_program_brings_its_installation_and_the_interpreter_of_its_first_line(tmp_path: Path) -> None:
-    node = program(tmp_path / "node" / "bin" / "node")
+    node = put_program(tmp_path / "node" / "bin" / "node", "")
     (tmp_path / "node" / "lib").mkdir()
-    cli = program(
-        tmp_path / "npm" / "lib" / "node_modules" / "cli" / "cli.js", f"#!/usr/bin/env -S {node} --flag"
-    )
+    modules = tmp_path / "npm" / "lib" / "node_modules"
+    cli = put_program(modules / "cli" / "cli.js", f"#!/usr/bin/env -S {node} --flag\n")
     link = tmp_path / "npm" / "bin" / "cli"
     link.parent.mkdir()
     link.symlink_to("../lib/node_modules/cli/cli.js")
@@ -65,7 +50,7 @@ def test_a_program_brings_its_installation_and_the_interpreter_of_its_first_line
 
 
 def test_a_lone_program_brings_itself_and_the_files_its_command_names(tmp_path: Path) -> None:
-    tool, data = program(tmp_path / "tools" / "tool"), tmp_path / "data.json"
+    tool, data = put_program(tmp_path / "tools" / "tool", ""), tmp_path / "data.json"
     data.touch()
     (tmp_path / "tools" / "secret").touch()
     needs = needs_of([str(tool), "--data", str(data), "/no/such/file", "word"], None)
@@ -92,7 +77,7 @@ def test_simulators_are_found_wherever_a_python_keeps_its_packages(tmp_path: Pat
 
 
 def test_hidden_folders_are_covered_in_a_folder_that_the_operator_shows(tmp_path: Path) -> None:
-    words = arguments(tmp_path, [], read=(str(tmp_path),))
+    words = arguments(tmp_path, read=(str(tmp_path),))
     covers = [words[i + 1] for i, word in enumerate(words) if word == "--tmpfs"]
     assert str(tmp_path / "runs") in covers
     shown = words.index(str(tmp_path))
@@ -103,12 +88,12 @@ def test_hidden_folders_are_covered_behind_a_link_too(tmp_path: Path) -> None:
     (tmp_path / "all").mkdir()
     link = tmp_path / "link"
     link.symlink_to(tmp_path)
-    words = arguments(tmp_path, [], read=(str(link),))
+    words = arguments(tmp_path, read=(str(link),))
     assert str(link / "runs") in [words[i + 1] for i, word in enumerate(words) if word == "--tmpfs"]
 
 
 def test_feedback_and_rules_lie_read_only_over_the_writable_workspace(tmp_path: Path) -> None:
-    words = arguments(tmp_path, [])
+    words = arguments(tmp_path)
     workspace = str(tmp_path / "runs" / "w")
     assert (workspace, workspace) in triples(words, "--bind")
     for name in ("feedback", "AGENTS.md"):
@@ -117,30 +102,17 @@ def test_feedback_and_rules_lie_read_only_over_the_writable_workspace(tmp_path: 
 
 
 def test_only_an_open_network_shares_this_machines(tmp_path: Path) -> None:
-    assert "--unshare-net" in arguments(tmp_path / "a", [])
-    assert "--unshare-net" not in arguments(tmp_path / "b", [], open_network=True)
+    assert "--unshare-net" in arguments(tmp_path / "a")
+    assert "--unshare-net" not in arguments(tmp_path / "b", open_network=True)
 
 
 def test_an_agents_second_program_finds_the_firsts_links(tmp_path: Path) -> None:
-    for home in ("/home/somebody", str(tmp_path)):
-        needs = needs_of([], None)
-        for place in ("/tmp/some/python", f"{home}/some/python"):
-            needs.links[place] = "/usr/bin/env"
-        view = View(
-            workspace=tmp_path / "w",
-            private=tmp_path / "private",
-            home=home,
-            needs=needs,
-            read=(),
-            write=(),
-            hidden=(),
-            open_network=False,
-        )
-        view.workspace.mkdir(exist_ok=True)
-        view.prepare()
+    for n, home in enumerate(("/home/somebody", str(tmp_path))):
+        shown = view(tmp_path / str(n), home=home, hidden=())
+        shown.needs.links |= dict.fromkeys(("/tmp/some/python", f"{home}/some/python"), "/usr/bin/env")
+        shown.prepare()
         for _ in range(2):
-            command = [*view.arguments(), "/tmp/some/python", f"{home}/some/python", "true"]
-            done = subprocess.run(command, capture_output=True, text=True, check=False)
+            done = run_program(*shown.arguments(), "/tmp/some/python", f"{home}/some/python", "true")
             assert done.returncode == 0, done.stderr
 
 
@@ -155,11 +127,10 @@ def test_links_towards_a_mount_are_removed_before_bubblewrap_follows(tmp_path: P
     (private / "home" / ".agents").symlink_to(f"/oldroot{outside}")
     (skill / "SKILL.md").write_text("Read the lamp twice.")
     shown = {"inputs": ((str(skill), str(skill)),), "read": (str(skill),)}
-    shown_in = view(tmp_path, ["sh"], **{"home": str(home), what: shown[what]})
+    shown_in = view(tmp_path, ("sh",), **{"home": str(home), what: shown[what]})
     shown_in.prepare()
-    words = shown_in.arguments()
     script = f"cat {skill}/SKILL.md; echo x >> {skill}/SKILL.md || echo refused"
-    done = subprocess.run([*words, "--", "sh", "-c", script], capture_output=True, text=True, check=False)
+    done = run_program(*shown_in.arguments(), "--", "sh", "-c", script)
     assert done.stdout == "Read the lamp twice.refused\n", done.stderr
     assert list(outside.iterdir()) == []
 
@@ -169,10 +140,9 @@ def test_links_on_the_way_to_a_link_are_removed_likewise(tmp_path: Path) -> None
     for folder in (private / "home", outside):
         folder.mkdir(parents=True)
     (private / "home" / ".local").symlink_to(f"/oldroot{outside}")
-    shown = view(tmp_path, ["sh"], home=str(home))
+    shown = view(tmp_path, ("sh",), home=str(home))
     shown.needs.links[f"{home}/.local/bin/cli"] = "/bin/sh"
     shown.prepare()
-    words = [*shown.arguments(), "--", f"{home}/.local/bin/cli", "-c", "echo started"]
-    done = subprocess.run(words, capture_output=True, text=True, check=False)
+    done = run_program(*shown.arguments(), "--", f"{home}/.local/bin/cli", "-c", "echo started")
     assert list(outside.iterdir()) == []
     assert done.stdout == "started\n", done.stderr

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import os
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any, get_args
 
 import msgspec
 import pytest
+from program_runs import run_python
 
 from evopolicy_gateway.processes import child_messages
 from evopolicy_gateway.processes.child_messages import AnyEvent, CloseRun
@@ -74,12 +72,5 @@ asyncio.run(main())
 
 
 def test_a_child_that_is_just_being_started_is_no_orphan(tmp_path: Path) -> None:
-    done = subprocess.run(
-        [sys.executable, "-c", OPERATOR, str(tmp_path / "log")],
-        env=dict(os.environ),
-        capture_output=True,
-        text=True,
-        timeout=90,
-        check=False,
-    )
+    done = run_python(OPERATOR, tmp_path / "log")
     assert done.stdout == "30\n", done.stderr

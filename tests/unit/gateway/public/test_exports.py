@@ -22,6 +22,7 @@ import pytest
 from invented import run_dirs
 from invented.policies import Version
 from invented.run_dirs import write_run
+from program_runs import run_program
 
 from evopolicy import load_runs
 from evopolicy._exports import tracking
@@ -48,16 +49,9 @@ def runs(tmp_path: Path) -> Path:
 
 def export(*words: str | Path, **environment: str) -> subprocess.CompletedProcess[str]:
     """The command, as a user calls it."""
-    program = Path(sys.executable).with_name("evopolicy")
     known = {"WANDB_MODE": "offline", "MLFLOW_DISABLE_TELEMETRY": "true"}
-    return subprocess.run(
-        [str(program), "export", *map(str, words)],
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=300,
-        env=os.environ | known | environment,
-    )
+    program = Path(sys.executable).with_name("evopolicy")
+    return run_program(program, "export", *words, timeout=300, env=os.environ | known | environment)
 
 
 def exported(*words: str | Path, **environment: str) -> str:
@@ -364,9 +358,8 @@ def test_wrong_calls_say_what_is_wrong(runs: Path, words: tuple[str, ...], expec
 
 
 def test_a_missing_library_is_named_with_its_extra(runs: Path, tmp_path: Path) -> None:
-    (tmp_path / "pyarrow.py").write_text(
-        "raise ModuleNotFoundError(\"No module named 'pyarrow'\", name='pyarrow')"
-    )
+    text = "raise ModuleNotFoundError(\"No module named 'pyarrow'\", name='pyarrow')"
+    (tmp_path / "pyarrow.py").write_text(text)
     done = export(runs, "--to", "parquet", "--out", tmp_path / "t", PYTHONPATH=str(tmp_path))
     assert done.returncode == 2
     assert "[export]'" in done.stderr

@@ -6,7 +6,6 @@ import asyncio
 import inspect
 import os
 import shutil
-import subprocess
 import sys
 import threading
 import time
@@ -17,6 +16,7 @@ from pathlib import Path
 import cloudpickle
 import msgspec
 import pytest
+from program_runs import run_program, run_python
 
 import evopolicy as evp
 from evopolicy import _functions, _loop
@@ -45,8 +45,7 @@ def test_every_public_name_is_documented_and_typed() -> None:
 
 def test_importing_it_starts_nothing() -> None:
     asked = "import evopolicy, threading; print(threading.active_count())"
-    done = subprocess.run([sys.executable, "-c", asked], capture_output=True, text=True, check=True)
-    assert done.stdout == "1\n"
+    assert run_python(asked).stdout == "1\n"
 
 
 def test_finished_runs_are_read_as_records(tmp_path: Path) -> None:
@@ -137,8 +136,7 @@ def test_a_functions_own_module_goes_with_it_to_the_jail(tmp_path: Path) -> None
     assert words.endswith(str(tmp_path / "function.pickle"))
     # Where the module of this test cannot be imported; the type that is only named must not be needed.
     asked = "import cloudpickle, pathlib, sys; print(cloudpickle.loads(pathlib.Path(sys.argv[1]).read_bytes())(None))"
-    command = [sys.executable, "-c", asked, str(tmp_path / "function.pickle")]
-    done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=tmp_path)
+    done = run_python(asked, tmp_path / "function.pickle", cwd=tmp_path)
     assert done.stdout == "42\n", done.stderr
 
 
@@ -147,13 +145,12 @@ def test_a_function_is_a_policy_where_only_the_standard_library_is(
     version: tuple[int, int], tmp_path: Path
 ) -> None:
     gain = 2
-    bundles.unpack(
-        _functions.policy_of(lambda observation: gain * observation + helper()), tmp_path / "policy"
-    )
+    made = _functions.policy_of(lambda observation: gain * observation + helper())
+    bundles.unpack(made, tmp_path / "policy")
     code = tmp_path / "policy" / "policy.py"
     code.write_text(code.read_text().replace(str(sys.version_info[:2]), str(version)))
     asked = f"import sys; sys.path.append({str(code.parent)!r}); import policy; print(policy.Policy(0, 0, 0).act(3))"
-    done = subprocess.run([sys.executable, "-ISc", asked], capture_output=True, text=True, check=False)
+    done = run_program(sys.executable, "-ISc", asked)
     assert done.stdout == ("47\n" if version == sys.version_info[:2] else ""), done.stderr
     assert ("evaluate a folder with a policy.py" in done.stderr) == (version == (2, 7))
 
@@ -178,10 +175,9 @@ def test_wrong_arguments_are_reported_before_anything_starts(tmp_path: Path) -> 
         evp.Cluster.local(slots=0)
     with pytest.raises(evp.ConfigError, match="give only one"):
         evp.Cluster.local(fresh=True, state=tmp_path)
+    policy = Path(__file__).parents[4] / "examples/policies/gym_acrobot"
     with pytest.raises(evp.ConfigError, match="not open"):
-        evp.Cluster.local().evaluate(
-            Path(__file__).parents[4] / "examples/policies/gym_acrobot", env="gym/acrobot"
-        )
+        evp.Cluster.local().evaluate(policy, env="gym/acrobot")
 
 
 def test_ctrl_c_waits_until_everything_is_in_order() -> None:
@@ -202,9 +198,7 @@ try:
 except KeyboardInterrupt:
     print("interrupted")
 """
-    done = subprocess.run(
-        [sys.executable, "-c", program], capture_output=True, text=True, check=False, timeout=60
-    )
+    done = run_python(program)
     assert done.stdout == "in order\ninterrupted\n", done.stderr
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import secrets
 from collections.abc import Awaitable, Callable
@@ -11,7 +12,7 @@ from typing import Any
 import pytest
 from stages import odd_answers
 from stages.model_api import Step
-from stages.relay_stage import KEY, PATHS, TOKEN, Served, played
+from stages.relay_stage import KEY, PATHS, TOKEN, Served, relay
 
 from evopolicy_common.records import model_record
 from evopolicy_common.records.model_record import Pack, read_calls, request_of
@@ -24,7 +25,17 @@ def recorded(
     tmp_path: Path, script: list[Step], act: Callable[[Served], Awaitable[Any]], **more: Any
 ) -> Served:
     more = {"record": "full", "folder": str(tmp_path / "model"), "tokens": ("a" * 32, TOKEN), **more}
-    return played(tmp_path, script, act, **more)
+
+    async def main() -> Served:
+        async with relay(tmp_path, script, **more) as served:
+            await act(served)
+            return served
+
+    return asyncio.run(main())
+
+
+async def asked_once(served: Served) -> None:
+    assert (await served.ask()).status_code == 200
 
 
 def contents(folder: Path) -> bytes:
@@ -106,15 +117,12 @@ def test_a_flood_ends_the_record_and_not_the_run(
 
 
 def test_a_killed_relays_half_written_record_is_continued(tmp_path: Path) -> None:
-    async def act(served: Served) -> None:
-        assert (await served.ask()).status_code == 200
-
     folder = tmp_path / "model"
-    recorded(tmp_path, [], act)
+    recorded(tmp_path, [], asked_once)
     for name in ("calls.jsonl", "content.pack"):
         data = (folder / name).read_bytes()
         (folder / name).write_bytes(data + data[: len(data) - 3])
-    recorded(tmp_path, [Step(text="another")], act)
+    recorded(tmp_path, [Step(text="another")], asked_once)
     calls = read_calls(folder)
     assert [call.n for call in calls] == [0, 1]
     with contextlib.closing(Pack(folder)) as pack:
@@ -123,12 +131,9 @@ def test_a_killed_relays_half_written_record_is_continued(tmp_path: Path) -> Non
 
 
 def test_digests_keep_no_content_and_off_keeps_nothing(tmp_path: Path) -> None:
-    async def act(served: Served) -> None:
-        assert (await served.ask()).status_code == 200
-
-    recorded(tmp_path, [], act, record="off")
+    recorded(tmp_path, [], asked_once, record="off")
     assert not (tmp_path / "model").exists()
-    recorded(tmp_path, [], act, record="digests")
+    recorded(tmp_path, [], asked_once, record="digests")
     assert {path.name for path in (tmp_path / "model").iterdir()} == {"calls.jsonl"}
     (call,) = read_calls(tmp_path / "model")
     assert call.digest

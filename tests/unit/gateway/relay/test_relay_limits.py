@@ -17,7 +17,7 @@ import msgspec
 import pytest
 from stages import odd_answers
 from stages.model_api import INPUT, OUTPUT, Step
-from stages.relay_stage import GEMINI, KEY, TOKEN, Served, asked, played
+from stages.relay_stage import GEMINI, KEY, TOKEN, asked, relay
 
 from evopolicy_common.wire.http import bound
 from evopolicy_gateway.processes.child_messages import StartRelay
@@ -32,7 +32,7 @@ MANY = {"prompt_tokens": 1_200_000, "completion_tokens": 1_000_000}
 
 
 @pytest.mark.parametrize("streams", [True, False])
-def test_an_answer_is_read_to_its_end_when_the_agent_has_gone(tmp_path: Path, streams: bool) -> None:
+async def test_an_answer_is_read_to_its_end_when_the_agent_has_gone(tmp_path: Path, streams: bool) -> None:
     """A stream that was cut before its last event counted 300 tokens of 2,200,000."""
     gone = threading.Event()
 
@@ -44,9 +44,9 @@ def test_an_answer_is_read_to_its_end_when_the_agent_has_gone(tmp_path: Path, st
         if streams:
             handler.wfile.write(b"".join(odd_answers.chunk(each) for each in (document, None)))
         else:
-            handler._send(200, json.dumps(document).encode(), "application/json")
+            odd_answers.answers(200, document)(handler, request)
 
-    async def act(served: Served) -> None:
+    async with relay(tmp_path, [Step(odd=long)]) as served:
         body = {"model": "m", "stream": streams, "tools": [{}]}
         with contextlib.suppress(httpx.ReadTimeout):
             async with served.client.stream("POST", "/v1/chat/completions", json=body, timeout=1.0) as answer:
@@ -55,28 +55,22 @@ def test_an_answer_is_read_to_its_end_when_the_agent_has_gone(tmp_path: Path, st
         gone.set()
         while not served.used.requests:
             await asyncio.sleep(0.02)
-
-    used = played(tmp_path, [Step(odd=long)], act).used
+    used = served.used
     assert (used.usage.total, used.estimated, used.failed) == (2_200_000, 0, 0)
 
 
-def test_requests_at_once_do_not_exceed_the_limit_together(tmp_path: Path) -> None:
+async def test_requests_at_once_do_not_exceed_the_limit_together(tmp_path: Path) -> None:
     """32 requests at once spent 3.2 million tokens with a limit of 1,000."""
-
-    async def act(served: Served) -> None:
+    async with relay(tmp_path, [], limits=Limits(max_tokens=INPUT)) as served:
         answers = await asyncio.gather(*(served.ask(max_completion_tokens=INPUT) for _ in range(32)))
         assert sum(each.status_code == 200 for each in answers) == 1
-
-    served = played(tmp_path, [], act, limits=Limits(max_tokens=INPUT))
     assert (served.api.n_asked, served.used.usage.total) == (1, INPUT + OUTPUT)
 
 
-def test_requests_that_fit_together_are_served_together(tmp_path: Path) -> None:
-    async def act(served: Served) -> None:
+async def test_requests_that_fit_together_are_served_together(tmp_path: Path) -> None:
+    async with relay(tmp_path, [], limits=Limits(max_tokens=100_000)) as served:
         answers = await asyncio.gather(*(served.ask(max_completion_tokens=100) for _ in range(8)))
         assert {each.status_code for each in answers} == {200}
-
-    played(tmp_path, [], act, limits=Limits(max_tokens=100_000))
 
 
 @pytest.mark.parametrize(
@@ -98,17 +92,14 @@ def test_a_request_that_ran_out_of_time_is_charged_its_reserve(tmp_path: Path) -
     assert (served.used.usage.output, served.used.estimated) == (5000, 1)
 
 
-def test_an_answer_above_its_reserve_makes_the_next_reserves_larger(tmp_path: Path) -> None:
+async def test_an_answer_above_its_reserve_makes_the_next_reserves_larger(tmp_path: Path) -> None:
     """A server that ignores the stated maximum must not let many requests pass at once."""
     usage = {"prompt_tokens": 10, "completion_tokens": 90_000}
     odd = Step(odd=odd_answers.stream({"choices": [], "usage": usage}))
-
-    async def act(served: Served) -> None:
+    async with relay(tmp_path, [odd] * 40, limits=Limits(max_tokens=250_000)) as served:
         assert (await served.ask(max_completion_tokens=1)).status_code == 200
         answers = await asyncio.gather(*(served.ask(max_completion_tokens=1) for _ in range(32)))
         assert sum(each.status_code == 200 for each in answers) <= 2
-
-    played(tmp_path, [odd] * 40, act, limits=Limits(max_tokens=250_000))
 
 
 @pytest.mark.parametrize(
@@ -158,19 +149,17 @@ def test_a_tier_that_the_provider_names_is_charged(tmp_path: Path) -> None:
         ("google", "POST", "v1beta/models/m:countTokens"),
     ],
 )
-def test_requests_without_cost_are_counted_and_limited(
+async def test_requests_without_cost_are_counted_and_limited(
     tmp_path: Path, protocol: Any, method: str, path: str
 ) -> None:
-    async def act(served: Served) -> None:
+    async with relay(tmp_path, [], protocol=protocol, limits=Limits(max_requests=1)) as served:
         for status in (200, 400):
             body = {"json": {}} if method == "POST" else {}
             assert (await served.client.request(method, f"/{path}", **body)).status_code == status
-
-    served = played(tmp_path, [], act, protocol=protocol, limits=Limits(max_requests=1))
     assert (served.used.requests, served.used.failed, served.used.usage.total) == (1, 0, 0)
 
 
-def test_bodies_that_never_end_do_not_fill_the_memory(
+async def test_bodies_that_never_end_do_not_fill_the_memory(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(service, "MAX_HELD_BYTES", 4 << 20)
@@ -180,7 +169,7 @@ def test_bodies_that_never_end_do_not_fill_the_memory(
             yield b" " * (1 << 20)
         await asyncio.sleep(60.0)
 
-    async def act(served: Served) -> None:
+    async with relay(tmp_path, []) as served:
         posts = [
             asyncio.ensure_future(served.client.post("/v1/responses", content=endless())) for _ in range(3)
         ]
@@ -193,8 +182,7 @@ def test_bodies_that_never_end_do_not_fill_the_memory(
         # Their memory is free again.
         while (await served.ask("responses", input="x" * (3 << 20))).status_code != 200:
             await asyncio.sleep(0.05)
-
-    assert played(tmp_path, [], act).used.requests == 1
+    assert served.used.requests == 1
 
 
 def test_hostile_documents_leave_the_relays_memory_bounded(tmp_path: Path) -> None:
@@ -242,9 +230,8 @@ def test_what_the_relay_adds_is_taken_back_after_a_refusal(tmp_path: Path) -> No
 
     def refuses(handler: Any, request: dict[str, Any]) -> None:
         if "stream_options" in request or request.get("seed"):
-            handler._send(
-                422, b'{"detail": "stream_options: extra fields not permitted"}', "application/json"
-            )
+            refusal = {"detail": "stream_options: extra fields not permitted"}
+            odd_answers.answers(422, refusal)(handler, request)
         else:
             odd_answers.stream(odd_answers.says("x" * 400))(handler, request)
 
@@ -263,20 +250,15 @@ def test_a_providers_own_words_pass_on_without_secrets(tmp_path: Path, kind: str
     words = json.dumps([{"error": {"message": f"thought_signature is missing for {KEY}" + "." * 900}}])
     spelt = words.replace("sk-the", "sk\\u002dthe").encode()
 
-    def says(handler: Any, _: dict[str, Any]) -> None:
-        handler._send(400, spelt, kind)
-
-    (answer,), _ = asked(tmp_path, [Step(odd=says)], {}, path=GEMINI, protocol="google")
+    script = [Step(odd=odd_answers.garbage(spelt, kind, 400))]
+    (answer,), _ = asked(tmp_path, script, {}, path=GEMINI, protocol="google")
     assert answer.status_code == 400
     assert "thought_signature is missing for [redacted]..." in answer.text
     assert "." * 900 in answer.text
 
 
 def test_an_account_without_quota_is_told_and_not_tried_again(tmp_path: Path) -> None:
-    def says(handler: Any, _: dict[str, Any]) -> None:
-        body = b'{"error": {"code": "insufficient_quota", "message": "no money"}}'
-        handler._send(429, body, "application/json")
-
+    says = odd_answers.answers(429, {"error": {"code": "insufficient_quota", "message": "no money"}})
     (answer,), served = asked(tmp_path, [Step(odd=says)], {})
     assert (answer.status_code, answer.headers["x-should-retry"]) == (429, "false")
     assert "retry-after" not in answer.headers
@@ -288,11 +270,9 @@ def test_google_without_events_is_counted_too(tmp_path: Path) -> None:
     one = {"candidates": [], "usageMetadata": usage | {"candidatesTokenCount": 1}}
     documents = [one, {"usageMetadata": usage, "modelVersion": "g-1"}]
 
-    def says(handler: Any, _: dict[str, Any]) -> None:
-        handler._send(200, json.dumps(documents).encode(), "application/json")
-
+    script = [Step(odd=odd_answers.answers(200, documents))]
     path = "models/g:streamGenerateContent"
-    _, served = asked(tmp_path, [Step(odd=says)], {}, path=path, protocol="google", model="g")
+    _, served = asked(tmp_path, script, {}, path=path, protocol="google", model="g")
     used = served.used
     assert (used.usage.input_noncached, used.usage.output, used.usage.reasoning) == (7, 5, 2)
     assert (used.models, used.other_models, used.estimated) == ({"g-1": 1}, {}, 0)

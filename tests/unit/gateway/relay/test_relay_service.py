@@ -17,7 +17,7 @@ import httpx
 import pytest
 from stages import odd_answers
 from stages.model_api import CACHED, CREATED, INPUT, OUTPUT, REASONING, Step
-from stages.relay_stage import GEMINI, KEY, NOON, PATHS, TOKEN, Served, asked, played
+from stages.relay_stage import GEMINI, KEY, NOON, PATHS, TOKEN, asked, relay
 
 from evopolicy_gateway.relay import service
 from evopolicy_gateway.relay.__main__ import tell
@@ -42,8 +42,8 @@ def test_an_answer_passes_and_is_counted_with_the_real_key(
     assert KEY not in served.ledger.read_text()
 
 
-def test_a_request_is_in_the_ledger_before_its_answer_ends(tmp_path: Path) -> None:
-    async def act(served: Served) -> None:
+async def test_a_request_is_in_the_ledger_before_its_answer_ends(tmp_path: Path) -> None:
+    async with relay(tmp_path, [Step(text="hello")]) as served:
         body = {"model": "m", "stream": True, "messages": []}
         async with served.client.stream("POST", "/v1/chat/completions", json=body) as answer:
             async for line in answer.aiter_lines():
@@ -52,19 +52,16 @@ def test_a_request_is_in_the_ledger_before_its_answer_ends(tmp_path: Path) -> No
                     return
         raise AssertionError("the stream had no end")
 
-    played(tmp_path, [Step(text="hello")], act)
 
-
-def test_only_the_agents_token_is_accepted(tmp_path: Path) -> None:
-    async def act(served: Served) -> None:
+async def test_only_the_agents_token_is_accepted(tmp_path: Path) -> None:
+    async with relay(tmp_path, []) as served:
         for name, value in (("x-api-key", TOKEN), ("api-key", TOKEN), ("x-goog-api-key", TOKEN)):
             served.client.headers = httpx.Headers({name: value})
             assert (await served.ask()).status_code == 200
         for wrong in ("", "Bearer", f"Bearer {KEY}", "Bearer é", TOKEN):
             served.client.headers = httpx.Headers({"authorization": wrong.encode()})
             assert (await served.ask()).status_code == 401
-
-    assert played(tmp_path, [], act).api.n_asked == 3
+    assert served.api.n_asked == 3
 
 
 def test_a_key_that_the_provider_repeats_does_not_reach_the_agent(tmp_path: Path) -> None:
@@ -93,18 +90,15 @@ def test_azure_gets_its_header_and_version(tmp_path: Path) -> None:
     assert served.api.keys == set()
 
 
-def test_requests_beyond_a_limit_are_refused_in_the_providers_form(tmp_path: Path) -> None:
+async def test_requests_beyond_a_limit_are_refused_in_the_providers_form(tmp_path: Path) -> None:
     """Attack: makes requests beyond its budget, many at once. Defence: requests in flight count."""
-
-    async def act(served: Served) -> None:
+    async with relay(tmp_path, [], limits=Limits(max_requests=3)) as served:
         answers = await asyncio.gather(*(served.ask() for _ in range(8)))
         assert sorted(each.status_code for each in answers)[:3] == [200, 200, 200]
         final = await served.ask()
         assert (final.status_code, final.headers["x-should-retry"]) == (400, "false")
         assert final.json()["error"]["code"] == "billing_hard_limit_reached"
         assert "model budget is spent: 3 requests" in final.text
-
-    served = played(tmp_path, [], act, limits=Limits(max_requests=3))
     assert served.api.n_asked == served.used.requests == 3
     assert served.spent[-1] == "3 requests"
 
@@ -182,12 +176,11 @@ def test_a_web_page_is_an_error_that_names_the_base_url(tmp_path: Path) -> None:
         (503, "Fri, 16 Jan 2026 12:00:20 GMT", "20", False),
     ],
 )
-def test_the_operator_is_told_of_the_first_failure_with_the_next_try(
+async def test_the_operator_is_told_of_the_first_failure_with_the_next_try(
     tmp_path: Path, status: int, retry_after: str | None, wait: str, final: bool
 ) -> None:
     odd = odd_answers.busy(status, **({} if retry_after is None else {"retry_after": retry_after}))
-
-    async def act(served: Served) -> None:
+    async with relay(tmp_path, [Step(odd=odd), Step(odd=odd), Step(text="ok"), Step(odd=odd)]) as served:
         answer = await served.ask()
         assert (answer.headers["retry-after"], "x-should-retry" in answer.headers) == (wait, final)
         await served.ask()
@@ -196,8 +189,6 @@ def test_the_operator_is_told_of_the_first_failure_with_the_next_try(
         assert served.notes[0].endswith(f"answered {status}; next try in {wait} s, at {at}")
         await served.ask()
         await served.ask()
-
-    served = played(tmp_path, [Step(odd=odd), Step(odd=odd), Step(text="ok"), Step(odd=odd)], act)
     assert len(served.notes) == 2
     assert (served.used.requests, served.used.failed) == (4, 3)
     assert served.used.wait_s >= 3 * int(wait)
@@ -210,13 +201,12 @@ def test_a_provider_that_cannot_be_reached_is_named(tmp_path: Path) -> None:
     assert served.used.failed == 1
 
 
-def test_half_a_stream_is_no_whole_answer(tmp_path: Path) -> None:
-    async def act(served: Served) -> None:
+async def test_half_a_stream_is_no_whole_answer(tmp_path: Path) -> None:
+    half = odd_answers.stream(odd_answers.says("x" * 400, end=False), whole=False)
+    async with relay(tmp_path, [Step(odd=half)]) as served:
         with pytest.raises(httpx.RemoteProtocolError):
             await served.ask()
-
-    half = odd_answers.stream(odd_answers.says("x" * 400, end=False), whole=False)
-    used = played(tmp_path, [Step(odd=half)], act).used
+    used = served.used
     assert (used.failed, used.estimated, used.usage.output) == (1, 1, 100)
 
 
@@ -245,15 +235,13 @@ def test_missing_and_wrong_counts_are_estimated_and_marked(tmp_path: Path, usage
     assert (used.estimated, used.failed, used.usage.output) == (1, 0, 100)
 
 
-def test_a_compressed_bomb_is_cut_off(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_a_compressed_bomb_is_cut_off(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(service, "MAX_ANSWER_BYTES", 8 << 20)
     monkeypatch.setattr(odd_answers, "BOMB_BYTES", 64 << 20)
-
-    async def act(served: Served) -> None:
+    async with relay(tmp_path, [Step(odd=odd_answers.bomb)]) as served:
         with pytest.raises(httpx.RemoteProtocolError):
             await served.ask()
-
-    assert played(tmp_path, [Step(odd=odd_answers.bomb)], act).used.failed == 1
+    assert served.used.failed == 1
 
 
 @pytest.mark.parametrize(
@@ -270,17 +258,15 @@ def test_a_compressed_bomb_is_cut_off(tmp_path: Path, monkeypatch: pytest.Monkey
         ("/v1/responses/../files", b"{}", {}, 404),
     ],
 )
-def test_hostile_requests_do_not_reach_the_provider(
+async def test_hostile_requests_do_not_reach_the_provider(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, path: str, body: bytes, headers: Any, status: int
 ) -> None:
     monkeypatch.setattr(service, "MAX_REQUEST_BYTES", 1000)
-
-    async def act(served: Served) -> None:
+    async with relay(tmp_path, []) as served:
         answer = await served.client.post(path, content=body, headers=headers)
         assert answer.status_code == status
         assert "error" in answer.json()
-
-    assert played(tmp_path, [], act).api.n_asked == 0
+    assert served.api.n_asked == 0
 
 
 @pytest.mark.parametrize(
@@ -292,47 +278,41 @@ def test_hostile_requests_do_not_reach_the_provider(
         "transfer-encoding:\tchunked, identity\r\n\r\n0\r\n\r\n",
     ],
 )
-def test_a_request_of_two_lengths_is_not_read_in_two_ways(tmp_path: Path, framing: str) -> None:
+async def test_a_request_of_two_lengths_is_not_read_in_two_ways(tmp_path: Path, framing: str) -> None:
     inner = f"POST /v1/responses HTTP/1.1\r\nhost: x\r\nauthorization: Bearer {TOKEN}\r\ncontent-length: 2\r\n\r\n{{}}"
     head = f"POST /v1/chat/completions HTTP/1.1\r\nhost: x\r\nauthorization: Bearer {TOKEN}\r\n"
-
-    async def act(served: Served) -> None:
+    async with relay(tmp_path, []) as served:
         reader, writer = await asyncio.open_connection("127.0.0.1", served.port)
         writer.write((head + framing + inner).encode())
         answer = await asyncio.wait_for(reader.read(), 30.0)
         writer.close()
         assert answer.count(b"HTTP/1.1") == 1
         assert answer.startswith(b"HTTP/1.1 4")
+    assert served.api.n_asked == 0
 
-    assert played(tmp_path, [], act).api.n_asked == 0
 
-
-def test_only_chosen_headers_reach_the_provider(tmp_path: Path) -> None:
+async def test_only_chosen_headers_reach_the_provider(tmp_path: Path) -> None:
     seen: dict[str, str] = {}
 
     def shows(handler: Any, _: dict[str, Any]) -> None:
         seen.update({name.lower(): value for name, value in handler.headers.items()})
         handler._send(200, b"{}", "application/json")
 
-    async def act(served: Served) -> None:
+    async with relay(tmp_path, [Step(odd=shows)]) as served:
         served.client.headers.update({"openai-organization": "other", "openai-beta": "b"})
         served.client.headers.update({"x-forwarded-for": "1.2.3.4"})
         await served.ask(stream=False)
-
-    played(tmp_path, [Step(odd=shows)], act)
     assert (seen["authorization"], seen["openai-beta"]) == (f"Bearer {KEY}", "b")
     assert not {"openai-organization", "x-forwarded-for"} & set(seen)
 
 
-def test_an_agent_that_goes_away_leaves_no_request_behind(tmp_path: Path) -> None:
-    async def act(served: Served) -> None:
+async def test_an_agent_that_goes_away_leaves_no_request_behind(tmp_path: Path) -> None:
+    async with relay(tmp_path, [Step(odd=odd_answers.hang(2.0))], limits=Limits(max_requests=2)) as served:
         with pytest.raises(httpx.ReadTimeout):
             await served.client.post("/v1/chat/completions", json={"model": "m", "tools": [{}]}, timeout=0.3)
         while served.used.requests == 0:
             await asyncio.sleep(0.02)
         assert (await served.ask()).status_code == 200
-
-    served = played(tmp_path, [Step(odd=odd_answers.hang(2.0))], act, limits=Limits(max_requests=2))
     assert (served.used.requests, served.used.failed) == (2, 1)
 
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 from stages.model_api import Step
-from stages.relay_stage import GEMINI, PATHS, Served, asked, played
+from stages.relay_stage import GEMINI, PATHS, asked, relay
 
 from evopolicy_gateway.relay import requests
 
@@ -142,33 +142,28 @@ def test_the_requests_of_coding_agents_and_what_a_provider_sent_pass(
         ("[]", "not a JSON object"),
     ],
 )
-def test_a_body_that_two_readers_could_read_in_two_ways_is_refused(
+async def test_a_body_that_two_readers_could_read_in_two_ways_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, terms: dict[str, Any], body: str, why: str
 ) -> None:
     monkeypatch.setattr(requests, "MAX_MARKS", 500 if "{}," in body else 300_000)
-
-    async def act(served: Served) -> None:
+    async with relay(tmp_path, [], **terms) as served:
         answer = await served.client.post("/v1/responses", content=body.encode())
         assert (answer.status_code, why in answer.text) == (400, True), answer.text
-
-    assert played(tmp_path, [], act, **terms).api.bodies == []
+    assert served.api.bodies == []
 
 
 @pytest.mark.parametrize(("path", "protocol"), PATHS.items())
-def test_a_body_is_sent_as_it_was_understood(tmp_path: Path, path: str, protocol: Any) -> None:
-    async def act(served: Served) -> None:
+async def test_a_body_is_sent_as_it_was_understood(tmp_path: Path, path: str, protocol: Any) -> None:
+    async with relay(tmp_path, [], protocol=protocol) as served:
         version = "v1beta" if protocol == "google" else "v1"
         spaced = b' {"mo\\u0064el" : "m",  "contents": [ "\\u00e9" ] } '
         assert (await served.client.post(f"/{version}/{path}", content=spaced)).status_code == 200
-
-    served = played(tmp_path, [], act, protocol=protocol)
     assert served.api.bodies == ['{"model":"m","contents":["é"]}'.encode()]
 
 
 @pytest.mark.parametrize("path", ["models/../files:generateContent", "models/a/b:generateContent", "files"])
-def test_other_paths_of_google_are_not_served(tmp_path: Path, path: str) -> None:
-    async def act(served: Served) -> None:
+async def test_other_paths_of_google_are_not_served(tmp_path: Path, path: str) -> None:
+    async with relay(tmp_path, [], protocol="google") as served:
         for each in (path, path.replace("/", "%2F")):
             assert (await served.client.post(f"/v1beta/{each}", json={})).status_code == 404
-
-    assert played(tmp_path, [], act, protocol="google").api.bodies == []
+    assert served.api.bodies == []

@@ -7,7 +7,6 @@ import contextlib
 import os
 import signal
 import socket
-import subprocess
 import sys
 import threading
 from collections.abc import Iterator
@@ -17,6 +16,7 @@ from typing import Any
 
 import pytest
 from gateway_double import served
+from program_runs import put_program, run_python
 from stages import cli_stage, command_stage
 from stages.cli_stage import settings
 from starlette.responses import PlainTextResponse
@@ -105,10 +105,7 @@ def test_pipes_that_a_child_holds_are_let_go(tmp_path: Path, monkeypatch: pytest
 
 def test_a_cli_that_tells_no_version_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(cli_agent, "_PROBE_TIMEOUT_S", SOON_S)
-    mute = tmp_path / "bin" / "claude"
-    mute.parent.mkdir()
-    mute.write_text("#!/bin/sh\nexec sleep 1000\n")
-    mute.chmod(0o755)
+    mute = put_program(tmp_path / "bin" / "claude", "exec sleep 1000")
     path = f"{mute.parent}:{os.environ['PATH']}"
     with pytest.raises(base.AgentError, match=r"does not answer --version.*timed out"):
         cli_stage.play(tmp_path, settings("claude-code"), "work", PATH=path)
@@ -157,14 +154,7 @@ print(asyncio.run(supervisor.keep(order, Orders())).reason)
 
 
 def test_a_harness_that_does_not_end_with_its_programs_is_cut_off(tmp_path: Path) -> None:
-    done = subprocess.run(
-        [sys.executable, "-c", SUPERVISOR],
-        capture_output=True,
-        text=True,
-        timeout=60,
-        cwd=tmp_path,
-        check=False,
-    )
+    done = run_python(SUPERVISOR, cwd=tmp_path)
     assert done.stdout.splitlines()[-1:] == ["told"], done.stderr
 
 
@@ -173,9 +163,7 @@ def test_a_harness_that_does_not_end_with_its_programs_is_cut_off(tmp_path: Path
 
 def test_a_bubblewrap_that_hangs_builds_no_jail(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(jail_settings, "_TIMEOUT_S", SOON_S)
-    program = tmp_path / "bwrap"
-    program.write_text("#!/bin/sh\nexec sleep 1000\n")
-    program.chmod(0o755)
+    put_program(tmp_path / "bwrap", "exec sleep 1000")
     monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
     with pytest.raises(ConfigError, match="timed out"):
         jail_settings.check_bubblewrap()
@@ -195,7 +183,7 @@ async def _sent(url: str, text: str) -> bytes:
         writer.close()
 
 
-def test_a_body_of_a_stranger_is_not_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_a_body_of_a_stranger_is_not_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(http, "STRANGER_LINGER", (1 << 20, SOON_S))
     received: list[dict[str, Any]] = []
 
@@ -206,13 +194,10 @@ def test_a_body_of_a_stranger_is_not_waited_for(monkeypatch: pytest.MonkeyPatch)
     async def send(message: Any) -> None:
         received.append(message)
 
-    async def main() -> None:
-        gate = http._TokenGate(PlainTextResponse("never"), "token", "bearer")
-        scope = {"type": "http", "method": "POST", "path": "/token/submit", "headers": []}
-        async with asyncio.timeout(60):
-            await gate(scope, receive, send)  # type: ignore[arg-type]
-
-    asyncio.run(main())
+    gate = http._TokenGate(PlainTextResponse("never"), "token", "bearer")
+    scope = {"type": "http", "method": "POST", "path": "/token/submit", "headers": []}
+    async with asyncio.timeout(60):
+        await gate(scope, receive, send)  # type: ignore[arg-type]
     assert received[0]["status"] in (401, 403)
     assert received[-1]["more_body"] is False
 
@@ -228,14 +213,11 @@ async def test_an_unawaited_submit_is_answered_soon(tmp_path: Path, monkeypatch:
         await s.pipeline.idle()
 
 
-def test_an_idle_connection_is_closed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_an_idle_connection_is_closed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(server, "KEEP_ALIVE_S", 1)
-
-    async def main() -> bytes:
-        async with served(tmp_path) as s:
-            return await _sent(s.urls.info, "GET PATH HTTP/1.1\r\nhost: x\r\n\r\n")
-
-    assert asyncio.run(main()).startswith(b"HTTP/1.1 200")
+    async with served(tmp_path) as s:
+        answer = await _sent(s.urls.info, "GET PATH HTTP/1.1\r\nhost: x\r\n\r\n")
+    assert answer.startswith(b"HTTP/1.1 200")
 
 
 async def test_an_endless_request_does_not_delay_the_services_end(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -260,15 +242,12 @@ async def test_an_endless_request_does_not_delay_the_services_end(monkeypatch: p
 # The operator's side.
 
 
-def test_a_child_that_ignores_being_asked_is_killed(tmp_path: Path) -> None:
-    async def main() -> int | None:
-        child = await Child.start([sys.executable, "-c", STUBBORN], tmp_path / "log", talks=True)
-        assert child._process.stdout is not None
-        await child._process.stdout.readline()
-        await child.end(SOON_S)
-        return child.exit_code
-
-    assert asyncio.run(main()) == -signal.SIGKILL
+async def test_a_child_that_ignores_being_asked_is_killed(tmp_path: Path) -> None:
+    child = await Child.start([sys.executable, "-c", STUBBORN], tmp_path / "log", talks=True)
+    assert child._process.stdout is not None
+    await child._process.stdout.readline()
+    await child.end(SOON_S)
+    assert child.exit_code == -signal.SIGKILL
 
 
 async def test_giving_up_ends_without_an_answer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -297,5 +276,4 @@ child.wait()
 
 
 def test_processes_that_survive_killing_are_reported() -> None:
-    done = subprocess.run([sys.executable, "-c", UNKILLABLE], capture_output=True, text=True, check=True)
-    assert done.stdout == "True\n"
+    assert run_python(UNKILLABLE).stdout == "True\n"

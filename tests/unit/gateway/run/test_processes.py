@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 from machines.own_processes import alive
+from program_runs import run_python
 
 from evopolicy_common.processes.proc import descendants
 from evopolicy_gateway.processes.trees import end_orphans
@@ -40,14 +41,7 @@ except ChildProcessError:
 
 
 def test_nothing_below_survives_however_it_hides(tmp_path: Path) -> None:
-    done = subprocess.run(
-        [sys.executable, "-c", SUPERVISOR],
-        env={**os.environ, "N": f"{tmp_path}/"},
-        capture_output=True,
-        text=True,
-        timeout=60,
-        check=False,
-    )
+    done = run_python(SUPERVISOR, env={**os.environ, "N": f"{tmp_path}/"})
     assert done.stdout == "nothing left\n", done.stderr
     assert not any(alive(int(path.name)) for path in tmp_path.iterdir())
 
@@ -92,8 +86,7 @@ sys.exit(breeder.wait())
 
 def test_children_of_a_spared_process_are_spared_too(tmp_path: Path) -> None:
     done, touched = tmp_path / "done", tmp_path / "touched"
-    command = [sys.executable, "-c", SEARCHER, BREEDER, str(done), str(touched)]
-    assert subprocess.run(command, timeout=600, check=False).returncode == 0
+    assert run_python(SEARCHER, BREEDER, done, touched, timeout=600).returncode == 0
     assert not touched.exists()
 
 
@@ -134,6 +127,5 @@ print(left, sorted(found))
 
 @pytest.mark.parametrize("program", [CHAIN, HEADLESS])
 def test_a_process_that_looks_dead_does_not_survive(program: str) -> None:
-    command = [sys.executable, "-c", ENDS, program]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=100, check=False)
+    done = run_python(ENDS, program)
     assert done.stdout == "[] []\n", done.stdout + done.stderr

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import os
 import shutil
-import subprocess
-import sys
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from program_runs import run_python
 
 NOBODY = 65534
 PUTS = f"""
@@ -45,9 +44,7 @@ def test_folders_of_a_containers_root_are_named_with_the_remedy(workspace: Path)
     os.chown(system, NOBODY, NOBODY)
 
     def put() -> str:
-        done = subprocess.run(
-            [sys.executable, "-c", PUTS, system], capture_output=True, text=True, check=False
-        )
+        done = run_python(PUTS, system)
         assert done.returncode == 0, done.stderr
         return done.stdout
 

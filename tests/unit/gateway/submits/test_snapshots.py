@@ -28,57 +28,36 @@ def test_a_snapshot_is_stored_under_its_digest(tmp_path: Path) -> None:
     assert [file.path for file in load(blobs.read_blob(taken.digest), taken.digest).files] == ["policy.py"]
 
 
-def remove(folder: Path) -> None:
-    (folder / "policy.py").unlink()
+SPOILT: dict[str, tuple[Callable[[Path], object], str, str]] = {
+    "no policy": (lambda folder: (folder / "policy.py").unlink(), "missing_policy", "policy.py"),
+    "a link as policy": (
+        lambda folder: (folder / "policy.py").unlink() or (folder / "policy.py").symlink_to("/etc/passwd"),
+        *("missing_policy", "symbolic link"),
+    ),
+    "a folder as policy": (
+        lambda folder: (folder / "policy.py").unlink() or (folder / "policy.py").mkdir(),
+        *("missing_policy", "policy.py"),
+    ),
+    "no system": (lambda folder: folder.rename(folder.with_name("else")), "missing_policy", "system"),
+    "a link as system": (
+        lambda folder: folder.symlink_to(folder.rename(folder.with_name("else"))),
+        *("missing_policy", "system"),
+    ),
+    "a link beside": (
+        lambda folder: (folder / "data").symlink_to("/etc"),
+        *("import_error", "data is a symbolic link"),
+    ),
+    "a huge file": (
+        lambda folder: [(folder / "weights.bin").touch(), os.truncate(folder / "weights.bin", 2 << 30)],
+        *("import_error", f"{MAX_BYTES:,}"),
+    ),
+    "a pipe": (lambda folder: os.mkfifo(folder / "pipe"), "import_error", "named pipe"),
+}
 
 
-def link_policy(folder: Path) -> None:
-    (folder / "policy.py").unlink()
-    (folder / "policy.py").symlink_to("/etc/passwd")
-
-
-def policy_is_a_folder(folder: Path) -> None:
-    (folder / "policy.py").unlink()
-    (folder / "policy.py").mkdir()
-
-
-def link_beside(folder: Path) -> None:
-    (folder / "data").symlink_to("/etc")
-
-
-def huge(folder: Path) -> None:
-    with (folder / "weights.bin").open("wb") as file:
-        file.truncate(2 << 30)
-
-
-def pipe(folder: Path) -> None:
-    os.mkfifo(folder / "pipe")
-
-
-def no_system(folder: Path) -> None:
-    folder.rename(folder.with_name("elsewhere"))
-
-
-def system_is_a_link(folder: Path) -> None:
-    folder.rename(folder.with_name("elsewhere"))
-    folder.symlink_to(folder.with_name("elsewhere"))
-
-
-@pytest.mark.parametrize(
-    ("spoil", "category", "named"),
-    [
-        (remove, "missing_policy", "policy.py"),
-        (link_policy, "missing_policy", "symbolic link"),
-        (policy_is_a_folder, "missing_policy", "policy.py"),
-        (no_system, "missing_policy", "system"),
-        (system_is_a_link, "missing_policy", "system"),
-        (link_beside, "import_error", "data is a symbolic link"),
-        (huge, "import_error", f"{MAX_BYTES:,}"),
-        (pipe, "import_error", "named pipe"),
-    ],
-)
+@pytest.mark.parametrize(("spoil", "category", "named"), SPOILT.values(), ids=SPOILT)
 def test_a_folder_that_cannot_be_a_bundle_has_a_verdict(
-    tmp_path: Path, spoil: Callable[[Path], None], category: str, named: str
+    tmp_path: Path, spoil: Callable[[Path], object], category: str, named: str
 ) -> None:
     folder = system(tmp_path)
     spoil(folder)
