@@ -13,6 +13,7 @@ from evopolicy_common.messages.episode import (
     FailureCategory,
     Job,
     PolicyFailure,
+    ResourceLimits,
 )
 from evopolicy_common.messages.operator import RunFinished
 from evopolicy_common.messages.run_settings import RunSettings
@@ -311,6 +312,19 @@ class Rig:
         self.close()
         self.work_off(session, values)
         return self.finished()
+
+    def evaluate(self, key: str = "e", **changes: Any) -> Any:
+        """Ask for an evaluation of one train case, twice, as evaluation `key` unless told otherwise."""
+        usual: dict[str, Any] = {"env": ENV, "bundle": BUNDLE, "split": "train", "case_ids": (4, 4)}
+        usual |= {"cases": (Case(seed=4), Case(seed=4)), "secret": b"x", "record": "full"}
+        usual |= {"sandbox_tier": "bwrap", "limits": ResourceLimits()}
+        return self.ask(operator.Evaluate, evaluation=key, key=key, **usual | changes)
+
+    def stay(self, session: str, n: int, seconds: float, *held: wire.Lease) -> None:
+        """Let one worker beat after each of `n` pauses."""
+        for _ in range(n):
+            self.pass_time(seconds)
+            self.beat(session, *held)
 
     # ---- reading ----
 

@@ -115,24 +115,31 @@ class World:
         message = StatusRequest(token="operate", **more)
         return await self.answer(Requested(keys.operator_key("c", "status"), message))
 
+    def creating(self, key: str = "run", *, proof: str = "", **settings: Any) -> Requested:
+        """An operator asks for a run."""
+        known = {"env": "toy/line", "entry": "e", "model": "m", "exp_id": "x", "budget": 100, **settings}
+        wanted = RunSettings(**known)
+        message = operator.CreateRun(token="operate", key=key, settings=wanted, replay_key=proof)
+        return Requested(keys.operator_key("c", "create"), message)
+
     async def create(self, key: str = "run") -> operator.RunCreated:
-        settings = RunSettings(env="toy/line", entry="e", model="m", exp_id="x", budget=100)
-        asked = Requested(
-            keys.operator_key("c", "create"), operator.CreateRun(token="operate", key=key, settings=settings)
-        )
-        created = await self.answer(asked)
+        created = await self.answer(self.creating(key))
         assert isinstance(created, operator.RunCreated), created
         return created
 
-    def submit(self, created: operator.RunCreated, key: str) -> Requested:
-        message = gateway.Submit(
-            run=created.run,
-            token=created.capability,
-            key=key,
-            env_instances=(0, 1),
-            bundle=None,
-            bundle_error=FAILURE,
-        )
+    def cancelling(self, run: str) -> Requested:
+        return Requested(keys.operator_key("c", "cancel"), operator.CancelRun(token="operate", run=run))
+
+    def waiting(self, run: str, wait_s: float) -> Requested:
+        """An operator waits for the run's end."""
+        message = operator.WaitRun(token="operate", run=run, wait_s=wait_s)
+        return Requested(keys.operator_key("c", "wait"), message)
+
+    def submit(self, created: operator.RunCreated, key: str, **more: Any) -> Requested:
+        """A submit of two episodes without a policy, unless told otherwise."""
+        usual = {"env_instances": (0, 1), "bundle": None}
+        usual |= {} if more.get("bundle") else {"bundle_error": FAILURE}
+        message = gateway.Submit(run=created.run, token=created.capability, key=key, **usual | more)
         return Requested(keys.gateway_key("c", created.run, "submit"), message)
 
     def state(self, created: operator.RunCreated) -> Requested:

@@ -2,38 +2,35 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 import tempfile
 from pathlib import Path
 
 import pytest
+from program_runs import run_python
 
 from evopolicy_results.cli.cluster import Where
 
 
-def _sweep(folder: Path, name: str) -> Path:
-    state = folder / name / ".cluster"
+def _sweep(folder: Path) -> Path:
+    state = folder / "sweep" / ".cluster"
     state.mkdir(parents=True)
     (state / "coordinator.sqlite").touch()
-    return folder / name
+    return folder / "sweep"
 
 
 @pytest.mark.parametrize("given", [".", "agent/gym_acrobot/0", ".."])
 def test_a_sweep_with_its_own_cluster_is_named_with_the_option(
     tmp_path: Path, given: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    sweep = _sweep(tmp_path, "sweep")
+    sweep = _sweep(tmp_path)
     (sweep / "agent/gym_acrobot/0").mkdir(parents=True)
     with pytest.raises(SystemExit):
         Where(None, None, True, None, runs=[sweep / given])
     assert f"add --state {sweep}/.cluster\n" in capsys.readouterr().err
 
 
-def test_named_states_and_running_clusters_are_taken_as_they_are(
-    tmp_path: Path,
-) -> None:
-    sweep = _sweep(tmp_path, "sweep")
+def test_named_states_and_running_clusters_are_taken_as_they_are(tmp_path: Path) -> None:
+    sweep = _sweep(tmp_path)
     alone = tmp_path / "runs" / "evolve"
     alone.mkdir(parents=True)
     assert Where(None, None, True, None, runs=[alone]).state is None
@@ -54,7 +51,5 @@ Where(None, None, True, None, runs=[Path(sys.argv[1])])
     with tempfile.TemporaryDirectory() as folder:
         Path(folder).chmod(0o755)
         Path(folder, "others").mkdir(mode=0)
-        done = subprocess.run(
-            [sys.executable, "-c", program, folder], capture_output=True, text=True, check=False
-        )
+        done = run_python(program, folder)
     assert done.returncode == 0, done.stderr

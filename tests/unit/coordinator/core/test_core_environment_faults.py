@@ -15,10 +15,7 @@ from collections.abc import Callable
 import pytest
 from rigs.core_rig import Rig, done, result, split_of
 
-from evopolicy_common.messages import operator
 from evopolicy_common.messages import worker as wire
-from evopolicy_common.messages.environment import Case
-from evopolicy_common.messages.episode import ResourceLimits
 from evopolicy_coordinator.core.contract.records import EvaluationRow, SubmitRow
 from evopolicy_coordinator.core.leasing.jobs import FAULTS_MAX
 
@@ -96,19 +93,6 @@ def test_one_machine_alone_ends_no_run_that_another_can_play(rig: Rig, machine: 
 
 def test_an_evaluation_of_an_environment_that_fails_ends_with_the_reason(rig: Rig) -> None:
     session = rig.register()
-    rig.ask(
-        operator.Evaluate,
-        evaluation="ev",
-        key="e",
-        env="toy/line",
-        bundle=None,
-        split="train",
-        case_ids=(4, 4),
-        cases=(Case(seed=4), Case(seed=4)),
-        secret=b"x",
-        record="full",
-        sandbox_tier="bwrap",
-        limits=ResourceLimits(),
-    )
+    rig.evaluate(bundle=None)
     failing(rig, session, where="", ends=lambda: not rig.core.state.evaluations)
-    assert rig.row(EvaluationRow, "ev").error.startswith(WHY)
+    assert rig.row(EvaluationRow, "e").error.startswith(WHY)

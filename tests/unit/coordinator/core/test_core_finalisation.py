@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+import itertools
 from typing import Any
 
 import hypothesis.strategies as st
@@ -9,12 +11,10 @@ import msgspec
 import pytest
 from hypothesis import given, settings
 from rigs import core_rig
-from rigs.asking import asked
-from rigs.core_rig import BUNDLE, Rig, done, split_of
+from rigs.core_rig import Rig, done, split_of
 
 from evopolicy_common.messages import operator
-from evopolicy_common.messages.environment import Case
-from evopolicy_common.messages.episode import Job, ResourceLimits
+from evopolicy_common.messages.episode import Job
 from evopolicy_common.messages.operator import EvaluationStarted, RunProgress
 from evopolicy_common.messages.run_settings import PUBLISHED
 from evopolicy_coordinator.core.contract.effects import ReadEvaluation
@@ -50,15 +50,10 @@ def test_the_best_on_hidden_validation_is_selected(rig: Rig) -> None:
 def test_a_run_tells_whether_its_environment_repeats_itself(monkeypatch: pytest.MonkeyPatch) -> None:
     honest = core_rig.describe
     for mark in (True, False):
-        monkeypatch.setattr(
-            core_rig,
-            "describe",
-            lambda env, mark=mark: msgspec.structs.replace(honest(env), deterministic=mark),
-        )
+        marked = functools.partial(honest, deterministic=mark)
+        monkeypatch.setattr(core_rig, "describe", marked)
         rig = Rig()
-        session = rig.register()
-        rig.create()
-        rig.submit(0)
+        session = rig.begin(0)
         rig.work_off(session)
         assert rig.finish(session).deterministic is mark
 
@@ -105,7 +100,7 @@ def test_random_actions_outside_a_run_are_the_reference_of_their_split(rig: Rig)
     session = rig.register(slots=3)
     reference = random_seeds(rig, session, "r1")
     heldout = rig.row(RunRow, "r1").heldout
-    ask(rig, bundle=None, split="heldout", case_ids=tuple(range(3)), cases=heldout)
+    rig.evaluate(bundle=None, split="heldout", case_ids=tuple(range(3)), cases=heldout)
     leases = rig.poll(session, 3)
     assert sorted(each.job.episodes[0].policy_seed for each in leases) == sorted(reference)
 
@@ -170,48 +165,23 @@ def test_a_restart_at_any_step_changes_nothing_of_the_result(stops: list[int]) -
                 rig.beat(session)
                 leases = rig.poll(session, 2)
                 idle = 0 if leases else idle + 1
-                rig.report_results(
-                    session,
-                    *(done(each, float(len(each.job.job_id)) + value_of(each.job)) for each in leases),
-                )
-        finished = rig.finished()
-        return (
-            finished.best_submit_index,
-            finished.val_scores,
-            finished.heldout_returns,
-            finished.budget_used,
-        )
+                values = ((each, float(len(each.job.job_id)) + value_of(each.job)) for each in leases)
+                rig.report_results(session, *itertools.starmap(done, values))
+        ended = rig.finished()
+        return ended.best_submit_index, ended.val_scores, ended.heldout_returns, ended.budget_used
 
     assert play(set(stops)) == play(set())
 
 
-def ask(rig: Rig, key: str = "e", **changes: Any) -> object:
-    values: dict[str, Any] = {
-        "request": rig.request(),
-        "evaluation": f"ev-{key}",
-        "key": key,
-        "env": "toy/line",
-        "bundle": BUNDLE,
-        "split": "train",
-        "case_ids": (4, 4),
-        "cases": (Case(seed=4), Case(seed=4)),
-        "secret": b"x",
-        "record": "full",
-        "sandbox_tier": "bwrap",
-        "limits": ResourceLimits(),
-    }
-    return rig.tell(asked(operator.Evaluate, **values | changes))
-
-
 def page(rig: Rig, cursor: int, wait_s: float = 0.0) -> ReadEvaluation:
-    answer = rig.ask(operator.EvaluationPoll, evaluation="ev-e", cursor=cursor, wait_s=wait_s)
+    answer = rig.ask(operator.EvaluationPoll, evaluation="e", cursor=cursor, wait_s=wait_s)
     assert isinstance(answer, ReadEvaluation)
     return answer
 
 
 def test_an_evaluation_plays_cases_outside_any_run(rig: Rig) -> None:
-    assert ask(rig) == EvaluationStarted(evaluation="ev-e", episodes=2)
-    assert ask(rig) == EvaluationStarted(evaluation="ev-e", episodes=2)
+    assert rig.evaluate() == EvaluationStarted(evaluation="e", episodes=2)
+    assert rig.evaluate() == EvaluationStarted(evaluation="e", episodes=2)
     assert "a worker that offers" in reason_text(page(rig, 0).waits_for)
     session = rig.register()
     rig.load()
@@ -223,10 +193,10 @@ def test_an_evaluation_plays_cases_outside_any_run(rig: Rig) -> None:
     assert (page(rig, 0).upto, page(rig, 0).finished, page(rig, 0).total) == (1, False, 2)
     rig.play(session, second)
     assert (page(rig, 1).upto, page(rig, 1).finished) == (2, True)
-    assert rig.row(EvaluationRow, "ev-e").finished
+    assert rig.row(EvaluationRow, "e").finished
     rig.load()
     assert page(rig, 0).finished
-    assert ask(rig) == EvaluationStarted(evaluation="ev-e")
+    assert rig.evaluate() == EvaluationStarted(evaluation="e")
     assert not rig.core.state.groups
 
 
@@ -236,15 +206,8 @@ def test_an_unknown_evaluation_is_refused(rig: Rig) -> None:
 
 
 def test_a_run_that_cannot_be_is_refused(rig: Rig) -> None:
-    wrongs: tuple[dict[str, Any], ...] = (
-        {"budget": 0},
-        {"least": 0},
-        {"least": 5, "most": 4},
-        {"n_valid": 0},
-        {"n_held": 0},
-        {"least": 17, "most": 20},
-    )
-    for wrong in wrongs:
+    zeros: list[dict[str, Any]] = [{name: 0} for name in ("budget", "least", "n_valid", "n_held")]
+    for wrong in (*zeros, {"least": 5, "most": 4}, {"least": 17, "most": 20}):
         answer = rig.create("r9", **wrong)
         assert answer.status == "bad_settings", wrong
     assert not rig.rows

@@ -13,9 +13,9 @@ BEGUN = BlobRef(digest="b" * 64, size=5000)
 LONGER = BlobRef(digest="c" * 64, size=6000)
 
 
-def playing(rig: Rig, *, n_valid: int = 1) -> tuple[str, wire.Lease]:
+def playing(rig: Rig) -> tuple[str, wire.Lease]:
     """A worker that plays hidden validation of a closed run."""
-    session = rig.begin(0, run={"n_valid": n_valid})
+    session = rig.begin(0, run={"n_valid": 1})
     rig.play(session, *rig.poll(session))
     rig.close("r1")
     lease = the_hidden_one(rig, session)

@@ -19,13 +19,13 @@ from evopolicy_coordinator.core.workers.membership import FORGET_S
 GROUP = "r1/s0/train"
 
 
-def one_job(*workers: str, slots: int = 2, **settings: Any) -> tuple[Rig, list[str], wire.Lease]:
+def one_job(*workers: str, **settings: Any) -> tuple[Rig, list[str], wire.Lease]:
     """A rig in which the first worker holds the lease of the only job."""
     rig = Rig(**settings)
-    sessions = [rig.register(worker, slots=slots) for worker in workers]
+    sessions = [rig.register(worker) for worker in workers]
     rig.create()
     rig.submit(0)
-    (lease,) = rig.poll(sessions[0], slots)
+    (lease,) = rig.poll(sessions[0])
     return rig, sessions, lease
 
 
@@ -126,17 +126,10 @@ def test_a_limit_verdict_after_a_silence_is_played_again() -> None:
     session = rig.register("w1")
     rig.beat(session, lease)
     used = PolicyFailure(category="oom", step_index=3, message="", limit=1.0, used=2.0)
-    episode = outcome_of(0)
-    rig.report_results(
-        session,
-        result(lease, "done", episodes=(wire.EpisodeOutcome(**{**fields(episode), "failure": used}),)),
-    )
+    episode = msgspec.structs.replace(outcome_of(0), failure=used)
+    rig.report_results(session, result(lease, "done", episodes=(episode,)))
     assert rig.core.state.groups[GROUP].done == 0
     assert len(rig.poll(session, wait_s=1.0)) == 1
-
-
-def fields(outcome: Any) -> dict[str, Any]:
-    return {name: getattr(outcome, name) for name in outcome.__struct_fields__}
 
 
 def test_the_same_hand_in_twice_is_committed_once() -> None:
@@ -167,8 +160,7 @@ def test_an_attempt_that_another_worker_was_given_is_ignored() -> None:
     rig.play(second, lease)
     assert rig.core.state.groups[GROUP].done == 0
     forged = result(lease, "done", episodes=(outcome_of(0),))
-    invented = wire.JobResult(**{**fields(forged), "attempt": 7, "lease_id": f"{GROUP}/0#7"})
-    rig.report_results(second, invented)
+    rig.report_results(second, msgspec.structs.replace(forged, attempt=7, lease_id=f"{GROUP}/0#7"))
     assert rig.core.state.groups[GROUP].done == 0
 
 
@@ -282,9 +274,7 @@ def test_a_worker_that_keeps_failing_is_benched_and_taken_back() -> None:
     assert rig.core.state.workers["w1"].benched_until > rig.now
     (run,) = rig.status().runs
     assert run.waits_for == "workers whose jobs kept failing to be tried again"
-    for _ in range(4):
-        rig.pass_time(2.0)
-        rig.beat(first)
+    rig.stay(first, 4, 2.0)
     assert len(rig.poll(first, wait_s=3.0)) == 1
 
 

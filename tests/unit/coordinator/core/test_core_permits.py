@@ -180,9 +180,7 @@ def test_a_request_that_is_never_sent_again_is_forgotten(rig: Rig) -> None:
     rig.create("r1", agent=None)
     assert not rig.permit("r1", HERE).granted
     assert "validation" not in splits(rig.poll(session, 8))
-    for _ in range(3):
-        rig.pass_time(4.0)
-        rig.beat(session, *leases)
+    rig.stay(session, 3, 4.0, *leases)
     assert "validation" in splits(rig.poll(session, 8))
     assert conflicts.kernel(rig.core.state, HERE).asks == {}
 
@@ -213,9 +211,7 @@ def test_a_returning_worker_without_leases_frees_its_kernel(rig: Rig) -> None:
 
 def test_a_lease_in_transit_is_not_taken_for_a_released_one(rig: Rig) -> None:
     session = scored(rig)
-    for _ in range(2):  # no lease is given up just after a start
-        rig.pass_time(10.0)
-        rig.beat(session)
+    rig.stay(session, 2, 10.0)  # no lease is given up just after a start
     rig.poll(session, 8, serial=7)
     rig.create("r1", agent=None)
     assert not rig.permit("r1", HERE).granted
@@ -274,13 +270,9 @@ def test_a_cancelled_runs_permit_ends_by_its_gateway_or_time(
     if confirmed:
         rig.close("r1")
     else:
-        rig.pass_time(10.0)
-        rig.beat(session)
-        rig.pass_time(10.0)
-        rig.beat(session)
+        rig.stay(session, 2, 10.0)
         assert "validation" not in splits(rig.poll(session, 2))
-        rig.pass_time(10.0)
-        rig.beat(session)
+        rig.stay(session, 1, 10.0)
     assert "validation" in splits(rig.poll(session, 8))
     rig.load()
     assert permits.permits_of_run(rig.core.state, "r1") == []
@@ -292,9 +284,7 @@ def test_an_operators_word_ends_a_permit_and_silence_does_not(rig: Rig) -> None:
     session = scored(rig)
     rig.create("r1", agent=HERE)
     rig.play(session, *rig.poll(session, 8))
-    for _ in range(100):
-        rig.pass_time(5.0)
-        rig.beat(session)
+    rig.stay(session, 100, 5.0)
     assert rig.poll(session, 8) == []
     (waits_for,) = [run.waits_for for run in rig.status().runs if run.run == "r0"]
     assert "evopolicy runs agent-gone r1" in waits_for
@@ -359,9 +349,7 @@ def test_a_worker_on_another_kernel_speaks_for_no_earlier_one(rig: Rig) -> None:
     session = scored(rig)
     assert "validation" in splits(rig.poll(session, 8))
     session = rig.begin(worker={"slots": 8, "boot_id": "another"}, run={"agent": None})
-    for _ in range(10):
-        rig.pass_time(2.0)
-        rig.beat(session)
+    rig.stay(session, 10, 2.0)
     assert not rig.permit("r1", HERE).granted
     assert rig.permit("r1", "elsewhere").granted
     rig.pass_time(rig.settings.silent_bar_s)

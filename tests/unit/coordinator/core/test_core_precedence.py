@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import pytest
-from rigs.core_rig import BUNDLE, Rig, split_of
+from rigs.core_rig import Rig, split_of
 
 from evopolicy_common.messages import gateway, operator
 from evopolicy_common.messages import worker as wire
@@ -28,6 +30,10 @@ def splits(leases: list[wire.Lease]) -> list[str]:
     return sorted({split_of(lease.job) for lease in leases})
 
 
+def reserved(rig: Rig) -> list[str]:
+    return [name for name, kernel in rig.core.state.kernels.items() if kernel.reservations]
+
+
 def keep_alive(rig: Rig, session: str, seconds: float, *held: wire.Lease) -> None:
     for _ in range(int(seconds / 2.0)):
         rig.pass_time(2.0)
@@ -35,12 +41,34 @@ def keep_alive(rig: Rig, session: str, seconds: float, *held: wire.Lease) -> Non
         rig.beat(session, *held)
 
 
-def waiting(rig: Rig, slots: int = 8) -> str:
-    """A worker, and a closed run `r0` whose hidden cases have waited for long for the agent of `r1`."""
+def beside(rig: Rig, slots: int = 8, agent: str = HERE) -> str:
+    """A worker, a closed run `r0` with hidden cases to play, and a run `r1` whose agent is there."""
     session = rig.register(slots=slots)
     closed(rig, session, "r0")
-    rig.create("r1", agent=HERE)
-    rig.play(session, *rig.poll(session, 8))  # the random reference
+    rig.create("r1", agent=agent)
+    rig.play(session, *rig.poll(session, slots))  # the random reference
+    return session
+
+
+def until_hidden(rig: Rig, session: str) -> wire.Lease:
+    """A job of hidden cases, for which a further train job of r1's submit waits."""
+    rig.submit(0, 1, run="r1")
+    (train,) = rig.poll(session, 1)
+    while split_of(train.job) != "train":
+        rig.play(session, train)
+        (train,) = rig.poll(session, 1)
+    # A train job that runs keeps the hidden ones away; meanwhile the order is turned over.
+    rig.core.state.runs["r0"].flow.kept_s = WAIT_S
+    keep_alive(rig, session, 4.0, train)
+    rig.play(session, train)
+    (hidden,) = rig.poll(session, 1)
+    assert split_of(hidden.job) == "validation"
+    return hidden
+
+
+def waiting(rig: Rig, slots: int = 8) -> str:
+    """The same after the hidden cases of `r0` have waited for long for the agent of `r1`."""
+    session = beside(rig, slots)
     keep_alive(rig, session, WAIT_S + 4.0)
     return session
 
@@ -93,21 +121,8 @@ def test_with_agents_elsewhere_train_and_hidden_jobs_take_turns() -> None:
 
 
 def test_submits_that_wait_for_hidden_cases_say_so(rig: Rig) -> None:
-    session = rig.register(slots=1)
-    closed(rig, session, "r0")
-    rig.create("r1", agent="remote")
-    rig.play(session, *rig.poll(session, 1))
-    rig.core.state.runs["r0"].flow.kept_s = WAIT_S
-    # A train job that runs keeps the hidden ones away; meanwhile the order is turned over.
-    rig.submit(0, 1, run="r1")
-    (train,) = rig.poll(session, 1)
-    while split_of(train.job) != "train":
-        rig.play(session, train)
-        (train,) = rig.poll(session, 1)
-    keep_alive(rig, session, 4.0, train)
-    rig.play(session, train)
-    (hidden,) = rig.poll(session, 1)
-    assert split_of(hidden.job) == "validation"
+    session = beside(rig, slots=1, agent="remote")
+    hidden = until_hidden(rig, session)
     keep_alive(rig, session, 10.0, hidden)
     state = rig.ask(gateway.StateRequest, run="r1").state
     assert state.waits_for == "hidden cases of another run to be scored"
@@ -131,16 +146,7 @@ def test_the_time_a_submit_is_held_counts_against_no_limit(rig: Rig) -> None:
     rig.create("r1", agent="remote", limits=ResourceLimits(submit_wall_s=20.0))
     closed(rig, session, "r0")
     rig.play(session, *rig.poll(session, 1))
-    rig.submit(0, 1, run="r1")
-    (train,) = rig.poll(session, 1)
-    while split_of(train.job) != "train":
-        rig.play(session, train)
-        (train,) = rig.poll(session, 1)
-    rig.core.state.runs["r0"].flow.kept_s = WAIT_S
-    keep_alive(rig, session, 4.0, train)
-    rig.play(session, train)
-    (hidden,) = rig.poll(session, 1)
-    assert split_of(hidden.job) == "validation"
+    hidden = until_hidden(rig, session)
     keep_alive(rig, session, 30.0, hidden)  # longer than the limit
     assert rig.core.state.runs["r1"].submits[0].status is None
     rig.play(session, hidden)
@@ -187,10 +193,7 @@ def test_an_agent_that_delays_others_is_named_until_its_limit() -> None:
     runs get no scores. Defence: the status names the run and the operator's commands; the run is
     cancelled seven days after the start (`--agent-wait`)."""
     rig = Rig(agent_wait_s=600.0)
-    session = rig.register(slots=8)
-    closed(rig, session, "r0")
-    rig.create("r1", agent="")
-    rig.play(session, *rig.poll(session, 8))
+    session = beside(rig, agent="")
     keep_alive(rig, session, 590.0)
     (stall,) = rig.status().stalls
     assert "agent of r1" in stall
@@ -225,8 +228,7 @@ def test_the_kernel_with_the_fewest_related_agents_is_reserved(rig: Rig) -> None
         for session in sessions:
             rig.poll(session, 0)
             rig.beat(session)
-    turned = [name for name, kernel in rig.core.state.kernels.items() if kernel.reservations]
-    assert turned == ["kernel-of-w2"]
+    assert reserved(rig) == ["kernel-of-w2"]
 
 
 def test_a_closed_runs_hidden_cases_precede_others_train_jobs(rig: Rig) -> None:
@@ -306,26 +308,9 @@ def test_a_rescore_waits_for_agents_of_related_runs(rig: Rig) -> None:
     session = rig.begin(worker={"slots": 8}, run={"agent": HERE})
     hidden = rig.core.state.runs["r1"].row.heldout
 
-    def rescore(key: str, related: tuple[Case, ...]) -> None:
-        new = (Case(seed=77_000),)
-        rig.ask(
-            operator.Evaluate,
-            evaluation=key,
-            key=key,
-            env="toy/line",
-            bundle=BUNDLE,
-            split="heldout",
-            case_ids=(40,),
-            cases=new,
-            secret=b"x",
-            record="actions",
-            sandbox_tier="bwrap",
-            limits=ResourceLimits(),
-            related=related,
-        )
-
-    rescore("of-another-epoch", ())
-    rescore("of-this-epoch", hidden)
+    new: dict[str, Any] = {"split": "heldout", "case_ids": (40,), "cases": (Case(seed=77_000),)}
+    rig.evaluate("of-another-epoch", record="actions", related=(), **new)
+    rig.evaluate("of-this-epoch", record="actions", related=hidden, **new)
     rig.play(session, *[lease for lease in rig.poll(session, 8) if split_of(lease.job) != "random"])
     played = {row.group for row in rig.rows.values() if isinstance(row, OutcomeRow)}
     assert played == {"evaluation/of-another-epoch"}
@@ -341,16 +326,9 @@ def test_a_rescore_waits_for_agents_of_related_runs(rig: Rig) -> None:
     assert "evaluation/of-this-epoch" in played
 
 
-def reserved(rig: Rig) -> list[str]:
-    return [name for name, kernel in rig.core.state.kernels.items() if kernel.reservations]
-
-
 def test_a_worker_that_never_polls_neither_frees_hidden_cases_nor_bars_agents(rig: Rig) -> None:
     """Attack: registers on a made-up kernel, so that hidden cases seem to have a place without agents."""
-    session = rig.register(slots=8)
-    closed(rig, session, "r0")
-    rig.create("r1", agent=HERE)
-    rig.play(session, *rig.poll(session, 8))
+    session = beside(rig)
     idle = rig.register("w2", boot_id="made-up")
     for _ in range(40):
         rig.pass_time(2.0)
@@ -369,10 +347,7 @@ def test_a_worker_that_never_polls_neither_frees_hidden_cases_nor_bars_agents(ri
 
 @pytest.mark.parametrize("away", ["class", "tier"])
 def test_hidden_cases_that_nobody_there_can_play_keep_no_agent_away(rig: Rig, away: str) -> None:
-    session = rig.register(slots=8)
-    closed(rig, session, "r0")
-    rig.create("r1", agent=HERE)
-    rig.play(session, *rig.poll(session, 8))
+    session = beside(rig)
     rig.ask(operator.SetWorker, worker="w1", state="paused")
     more = {"version": "2"} if away == "class" else {"tiers": ("landlock",)}
     other = rig.register("w2", boot_id=HERE, **more)

@@ -20,19 +20,10 @@ from evopolicy_coordinator.server.reason_texts import env_failure, reason_text
 from evopolicy_worker.environments.interface.fingerprint import PACKAGES
 
 
-def validating(rig: Rig, session: str, n: int = 1) -> None:
-    """Bring run r1 to where its validation waits."""
-    rig.create(n_valid=8)
-    rig.submit(*range(n))
-    for _ in range(n):
-        (lease,) = rig.poll(session, 1)
-        rig.play(session, lease)
-    rig.close("r1")
-
-
 def test_train_goes_before_validation_and_stops_none(rig: Rig) -> None:
-    session = rig.register(slots=4)
-    validating(rig, session)
+    session = rig.begin(0, worker={"slots": 4}, run={"n_valid": 8})
+    rig.play(session, *rig.poll(session, 1))
+    rig.close("r1")
     rig.create("r2", hidden_from=9000)
     (hidden,) = rig.poll(session, 1)
     rig.submit(0, 1, run="r2", key="x")
@@ -43,23 +34,29 @@ def test_train_goes_before_validation_and_stops_none(rig: Rig) -> None:
     assert {split_of(lease.job) for lease in rig.poll(session, 3)} <= {"validation", "random"}
 
 
-def test_two_runs_share_the_slots_whatever_they_have_waiting(rig: Rig) -> None:
-    session = rig.begin(worker={"slots": 2}, run={"budget": 64, "most": 64})
-    rig.create("r2", budget=64, most=64)
-    rig.submit(*range(40), run="r1")
-    rig.submit(*range(8), run="r2", key="x")
+MANY = {"budget": 64, "most": 64}
+
+
+def leased(rig: Rig, session: str, rounds: int) -> Counter[str]:
+    """Leases of each run, while one worker plays."""
     got: Counter[str] = Counter()
-    for _ in range(8):
+    for _ in range(rounds):
         leases = rig.poll(session, 2)
         got.update(lease.job.job_id.split("/")[0] for lease in leases)
         rig.play(session, *leases)
-    assert got == {"r1": 8, "r2": 8}
+    return got
+
+
+def test_two_runs_share_the_slots_whatever_they_have_waiting(rig: Rig) -> None:
+    session = rig.begin(*range(40), run=MANY)
+    rig.create("r2", **MANY)
+    rig.submit(*range(8), run="r2", key="x")
+    assert leased(rig, session, 8) == {"r1": 8, "r2": 8}
 
 
 def test_a_worker_cannot_forge_the_fair_shares_time(rig: Rig) -> None:
-    session = rig.begin(worker={"slots": 2}, run={"budget": 64, "most": 64})
-    rig.create("r2", budget=64, most=64)
-    rig.submit(*range(40), run="r1")
+    session = rig.begin(*range(40), run=MANY)
+    rig.create("r2", **MANY)
     rig.submit(*range(40), run="r2", key="x")
     got: Counter[str] = Counter()
     for _ in range(8):
@@ -75,18 +72,11 @@ def test_a_worker_cannot_forge_the_fair_shares_time(rig: Rig) -> None:
 
 
 def test_a_run_that_was_idle_earns_nothing_by_it(rig: Rig) -> None:
-    session = rig.register(slots=2)
-    rig.create("r1", budget=64, most=64)
-    rig.submit(*range(40), run="r1")
-    for _ in range(10):
-        rig.play(session, *rig.poll(session, 2))
-    rig.create("r2", budget=64, most=64)
+    session = rig.begin(*range(40), run=MANY)
+    leased(rig, session, 10)
+    rig.create("r2", **MANY)
     rig.submit(*range(20), run="r2", key="x")
-    got: Counter[str] = Counter()
-    for _ in range(5):
-        leases = rig.poll(session, 2)
-        got.update(lease.job.job_id.split("/")[0] for lease in leases)
-        rig.play(session, *leases)
+    got = leased(rig, session, 5)
     assert abs(got["r1"] - got["r2"]) <= 2
 
 
@@ -131,19 +121,13 @@ def test_new_work_goes_to_the_worker_that_has_its_bundle_warm(rig: Rig) -> None:
 
 
 def test_a_worker_gets_only_what_it_can_play(rig: Rig) -> None:
-    rig.register("w1", envs=("toy/line",))
-    other = rig.register("w2", envs=("toy/maze",))
-    weak = rig.register("w3", tiers=("none",))
-    rig.create()
-    rig.submit(0)
-    assert rig.poll(other) == []
-    assert rig.poll(weak) == []
+    rig.begin(0)
+    for other in (rig.register("w2", envs=("toy/maze",)), rig.register("w3", tiers=("none",))):
+        assert rig.poll(other) == []
 
 
 def test_a_run_stays_with_its_fingerprint_class_until_an_operator_says_otherwise(rig: Rig) -> None:
-    rig.register("w1", version="1")
-    rig.create()
-    rig.submit(0)
+    rig.begin(0)
     other = rig.register("w2", version="2")
     assert rig.poll(other) == []
     rig.pass_time(20.0)
@@ -163,22 +147,20 @@ def test_a_run_stays_with_its_fingerprint_class_until_an_operator_says_otherwise
 
 
 def test_a_run_names_the_installations_that_played_it_and_only_those(rig: Rig) -> None:
-    workers = [
-        rig.register(f"w{k}", slots=1, installation=name) for k, name in enumerate(("base@1", "atari@2"))
-    ]
+    workers = [rig.register(name, slots=1, installation=f"{name}@1") for name in ("base", "atari")]
     rig.register("idle", installation="unused@3")
     rig.create()
     rig.submit(0, 1)
     for worker in workers:
         rig.play(worker, *rig.poll(worker, 1))
     rig.load()
-    again = rig.register("w1", installation="atari@2")
+    again = rig.register("atari", installation="atari@1")
     rig.close()
     for _ in range(90):
         rig.pass_time(1.0)
         rig.beat(again)
         rig.work_off(again)
-    assert rig.finished().installations == ("base@1", "atari@2")
+    assert rig.finished().installations == ("base@1", "atari@1")
 
 
 def pinned_versions(file: str) -> dict[str, str]:
@@ -192,9 +174,7 @@ def test_a_worker_with_the_papers_versions_is_its_own_class() -> None:
     assert paper.keys() == usual.keys() == {"gymnasium", "highway-env", "minigrid", "mujoco"}
     assert set(paper) <= {name.lower() for name in PACKAGES}
     rig = Rig()
-    rig.register("w1", packages=usual)
-    rig.create()
-    rig.submit(0)
+    rig.begin(0, worker={"packages": usual})
     other = rig.register("w2", packages=usual | paper)
     assert rig.poll(other) == []
     workers = {each.worker: each for each in rig.status().workers}
@@ -218,9 +198,7 @@ def versioned(env: str = "toy/line", **more: Any) -> EnvironmentDescription:
 def test_what_plays_other_environments_makes_no_other_class_of_this_one(
     rig: Rig, more: dict[str, Any], described: tuple[EnvironmentDescription, ...]
 ) -> None:
-    rig.register("w1", described=(versioned(),))
-    rig.create()
-    rig.submit(0)
+    rig.begin(0, worker={"described": (versioned(),)})
     other = rig.register("w2", described=described, **more)
     assert len(rig.poll(other)) == 1
 
@@ -237,19 +215,13 @@ def test_what_plays_other_environments_makes_no_other_class_of_this_one(
 def test_two_definitions_of_one_environment_are_two_classes(
     rig: Rig, changed: dict[str, Any], named: str
 ) -> None:
-    rig.register("w1", described=(versioned(),))
-    rig.create()
-    rig.submit(0)
+    rig.begin(0, worker={"described": (versioned(),)})
     other = rig.register("w2", described=(versioned(**changed),))
     assert rig.poll(other) == []
     (worker,) = (each for each in rig.status().workers if each.worker == "w2")
     assert named in worker.refused["r1"]
-    reply = rig.ask(
-        operator.RepinRun,
-        run="r1",
-        fingerprint_class=worker.classes["toy/line"],
-        reason="the old host is gone",
-    )
+    there = worker.classes["toy/line"]
+    reply = rig.ask(operator.RepinRun, run="r1", fingerprint_class=there, reason="the old host is gone")
     assert reply == operator.Done()
     assert len(rig.poll(other)) == 1
 

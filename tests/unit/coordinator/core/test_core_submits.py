@@ -110,12 +110,8 @@ def test_a_snapshot_that_could_not_be_made_is_a_verdict_and_charged() -> None:
     failure = PolicyFailure(category="missing_policy", step_index=None, message="no policy.py")
     answer = rig.submit(0, 1, bundle=None, bundle_error=failure)
     assert answer.remaining_budget == 14
-    row = rig.row(SubmitRow, "r1", 0)
-    assert (row.status, row.failure, rig.core.state.runs["r1"].ledger.settled) == (
-        "missing_policy",
-        failure,
-        2,
-    )
+    row, settled = rig.row(SubmitRow, "r1", 0), rig.core.state.runs["r1"].ledger.settled
+    assert (row.status, row.failure, settled) == ("missing_policy", failure, 2)
     assert rig.results().upto == 0
     assert isinstance(rig.submit(0, key="k1"), gateway.SubmitAccepted)
 
@@ -127,9 +123,7 @@ def test_a_submit_limit_keeps_episodes_before_the_first_unfinished() -> None:
     rig.submit(0, 1, 2, 3)
     leases = {lease.job.episodes[0].index: lease for lease in rig.poll(session, 8)}
     rig.play(session, leases[0], leases[1], leases[3])
-    for _ in range(10):
-        rig.pass_time(4.0)
-        rig.beat(session, leases[2])
+    rig.stay(session, 10, 4.0, leases[2])
     row = rig.row(SubmitRow, "r1", 0)
     assert (row.status, row.n_kept, row.released) == ("rollout_timeout", 2, 3)
 
@@ -139,18 +133,14 @@ def test_a_fault_of_ours_costs_neither_limit_nor_budget() -> None:
     for _ in range(4):
         (lease,) = rig.poll(session, 8, wait_s=1.0)
         rig.report_results(session, result(lease, "failed", error="environment my/env, step 3: it hangs"))
-        for _ in range(10):
-            rig.pass_time(3.0)
-            rig.beat(session)
+        rig.stay(session, 10, 3.0)
         assert rig.row(SubmitRow, "r1", 0).status is None
     ledger = rig.core.state.runs["r1"].ledger
     assert (ledger.reserved, ledger.settled) == (1, 0)
     assert "my/env, step 3" in next(iter(rig.core.state.groups["r1/s0/train"].jobs.values())).last_failure
     # Without further faults the limit counts.
     (lease,) = rig.poll(session, 8, wait_s=1.0)
-    for _ in range(30):
-        rig.pass_time(3.0)
-        rig.beat(session, lease)
+    rig.stay(session, 30, 3.0, lease)
     assert rig.row(SubmitRow, "r1", 0).status == "rollout_timeout"
 
 
@@ -158,15 +148,11 @@ def test_a_fault_counts_after_an_episode_with_more_is_done() -> None:
     rig, session = started(0, 1, limits=ResourceLimits(submit_wall_s=30.0))
     leases = {lease.job.episodes[0].index: lease for lease in rig.poll(session, 8)}
     rig.report_results(session, result(leases[0], "failed", error="environment my/env: it hangs"))
-    for _ in range(12):  # the limit begins again
-        rig.pass_time(3.0)
-        rig.beat(session, leases[1])
+    rig.stay(session, 12, 3.0, leases[1])  # the limit begins again
     (again,) = rig.poll(session, 8, wait_s=1.0)
     rig.play(session, again)
     rig.report_results(session, result(leases[1], "failed", error="environment my/env: it hangs"))
-    for _ in range(12):
-        rig.pass_time(3.0)
-        rig.beat(session)
+    rig.stay(session, 12, 3.0)
     assert rig.row(SubmitRow, "r1", 0).status is None
 
 
@@ -204,9 +190,7 @@ def test_outcomes_that_do_not_fit_the_job_are_the_workers_failure() -> None:
         (msgspec.structs.replace(outcome_of(0), reward_components={f"{k:1024}": 0.0 for k in range(3000)}),),
     ]
     for episodes in bad:
-        for _ in range(8):
-            rig.pass_time(10.0)
-            rig.beat(session)
+        rig.stay(session, 8, 10.0)
         (lease,) = rig.poll(session, 1, wait_s=0.5)
         rig.report_results(session, result(lease, "done", episodes=episodes))
         assert rig.core.state.groups["r1/s0/train"].done == 0

@@ -6,11 +6,9 @@ import sqlite3
 from pathlib import Path
 
 import pytest
-from rigs.service_world import Requested, started
+from rigs.service_world import started
 
 from evopolicy_common.errors import StorageError
-from evopolicy_common.messages import operator
-from evopolicy_common.wire import keys
 from evopolicy_coordinator.server import service
 from evopolicy_coordinator.storage import disk_use, store
 from evopolicy_coordinator.storage.store import Store
@@ -26,8 +24,7 @@ async def test_a_query_that_nobody_waits_for_any_more_is_let_go(
     async with started(tmp_path) as world:
         created = await world.create()
         monkeypatch.setattr(service, "_FORGET_S", SOON_S)
-        wait = operator.WaitRun(token="operate", run=created.run, wait_s=60)
-        assert await world.answer(Requested(keys.operator_key("c", "wait"), wait)) is None
+        assert await world.answer(world.waiting(created.run, 60)) is None
 
 
 def test_a_database_that_another_keeps_locked_is_reported(

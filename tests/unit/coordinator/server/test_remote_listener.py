@@ -17,11 +17,8 @@ class Unreadable:
         raise PermissionError("certs/machines.json")
 
 
-def test_a_list_of_machines_that_cannot_be_read_is_reported_at_once() -> None:
-    async def scenario() -> None:
-        listener = remote_listener("c", ("tls/h:1",), Unreadable(), print, print)  # type: ignore[arg-type]
+async def test_a_list_of_machines_that_cannot_be_read_is_reported_at_once() -> None:
+    listener = remote_listener("c", ("tls/h:1",), Unreadable(), print, print)  # type: ignore[arg-type]
+    with pytest.raises(PermissionError, match=r"machines\.json"):
         async with asyncio.timeout(20), listener:
             pass
-
-    with pytest.raises(PermissionError, match=r"machines\.json"):
-        asyncio.run(scenario())

@@ -13,29 +13,23 @@ from typing import Any
 
 import msgspec
 import pytest
-from rigs.service_world import Requested, World, started
+from rigs.service_world import World, started
 
 from evopolicy_common.messages import operator
-from evopolicy_common.messages.run_settings import RunSettings
 from evopolicy_common.messages.worker import Refused
 from evopolicy_common.records import journal
-from evopolicy_common.wire import keys
 from evopolicy_coordinator.core.contract.records import JournalRow, RunRow
 from evopolicy_coordinator.storage.store import rows
 
-OWN = {"hidden_cases": "per_run", "budget": 100}
+OWN = {"hidden_cases": "per_run"}
 
 
 async def create(world: World, key: str, proof: str = "", **settings: Any) -> Any:
-    known = {"env": "toy/line", "entry": "e", "model": "m", "exp_id": "x", **settings}
-    wanted = RunSettings(**known)
-    message = operator.CreateRun(token="operate", key=key, settings=wanted, replay_key=proof)
-    return await world.answer(Requested(keys.operator_key("c", "create"), message))
+    return await world.answer(world.creating(key, proof=proof, **OWN | settings))
 
 
 async def cancel(world: World, run: str) -> None:
-    asked = Requested(keys.operator_key("c", "cancel"), operator.CancelRun(token="operate", run=run))
-    assert isinstance(await world.answer(asked), operator.Done)
+    assert isinstance(await world.answer(world.cancelling(run)), operator.Done)
 
 
 def row(world: World, run: str) -> RunRow:
@@ -44,11 +38,11 @@ def row(world: World, run: str) -> RunRow:
 
 async def test_a_replay_has_secret_and_cases_of_its_run_and_is_marked(tmp_path: Path) -> None:
     async with started(tmp_path) as world:
-        first = await create(world, "first", **OWN)
+        first = await create(world, "first")
         await cancel(world, first.run)
-        again = await create(world, "again", "first", replay_of=first.run, **OWN)
-        stranger = await create(world, "stranger", **OWN)
-        assert (await create(world, "again", "first", replay_of=first.run, **OWN)) == again
+        again = await create(world, "again", "first", replay_of=first.run)
+        stranger = await create(world, "stranger")
+        assert (await create(world, "again", "first", replay_of=first.run)) == again
         original, replay, other = (row(world, each.run) for each in (first, again, stranger))
         for name in ("secret", "train", "validation", "heldout", "split_hashes", "epoch", "max_steps"):
             assert getattr(replay, name) == getattr(original, name), name
@@ -84,13 +78,13 @@ async def test_a_run_that_falsely_claims_to_be_a_replay_is_refused(
     tmp_path: Path, claim: str, why: str
 ) -> None:
     async with started(tmp_path) as world:
-        first = await create(world, "first", **OWN)
+        first = await create(world, "first")
         if claim != "open":
             await cancel(world, first.run)
-        proof, settings = "first", {"model": "m", **OWN}
+        proof, settings = "first", dict[str, Any]()
         match claim:
             case "another operator's":
-                await create(world, "second", **OWN)
+                await create(world, "second")
                 proof = "second"
             case "without its key":
                 proof = ""
@@ -107,8 +101,8 @@ async def test_a_run_that_falsely_claims_to_be_a_replay_is_refused(
 
 async def test_a_run_of_another_coordinator_is_replayed_with_a_new_secret(tmp_path: Path) -> None:
     async with started(tmp_path) as world:
-        first = await create(world, "first", **OWN)
-        again = await create(world, "again", "first", replay_of="r-0123456789abcdef", **OWN)
+        first = await create(world, "first")
+        again = await create(world, "again", "first", replay_of="r-0123456789abcdef")
         assert row(world, again.run).secret != row(world, first.run).secret
         assert row(world, again.run).heldout != row(world, first.run).heldout
         assert row(world, again.run).settings.replay_of == "r-0123456789abcdef"

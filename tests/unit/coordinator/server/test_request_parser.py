@@ -13,6 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rigs.core_rig import describe, fingerprint
 from rigs.finished_run import finished
+from rigs.service_world import IDENTITY
 from rigs.store_rows import blob
 
 from evopolicy_common.catalogue import worlds
@@ -34,13 +35,7 @@ from evopolicy_coordinator.server.request_parser import REQUESTS, RequestParser
 from evopolicy_coordinator.server.run_requests import RunRequests
 from evopolicy_coordinator.server.uploads import Uploads
 from evopolicy_coordinator.splits import SplitSource
-from evopolicy_coordinator.storage.state_folder import ROLES, Identity
 from evopolicy_coordinator.storage.store import Store
-
-IDENTITY = Identity(
-    cluster="c", passwords=dict.fromkeys(ROLES, "p"), worker_token="join", operator_token="operate"
-)
-
 
 CAPABILITIES = {"r": "capable"}
 
@@ -63,11 +58,8 @@ def parser(tmp_path: Path, blobs: BlobStore, uploads: Uploads) -> RequestParser:
 def make_parser(
     state: Path, blobs: BlobStore | None = None, uploads: Uploads | None = None, data: Path | None = None
 ) -> RequestParser:
-    source, blobs, uploads = (
-        SplitSource(data=data, secret=b"s" * 32),
-        blobs or BlobStore(state),
-        uploads or Uploads(),
-    )
+    source, blobs = SplitSource(data=data, secret=b"s" * 32), blobs or BlobStore(state)
+    uploads = uploads or Uploads()
     reader = ServiceReader(state / "db", blobs, uploads, state)
     runs = RunRequests(reader, blobs, source, allowed_imports=("numpy",), denied_imports=("gymnasium",))
     return RequestParser(IDENTITY, blobs, uploads, runs, Machines(state), Definitions())
@@ -94,15 +86,17 @@ def create(**settings: Any) -> operator.CreateRun:
 
 
 def evaluate(**changes: Any) -> operator.Evaluate:
-    values = {
-        "token": "operate",
-        "key": "k",
-        "env": "toy/line",
-        "bundle": None,
-        "split": "train",
-        "cases": None,
-    }
-    return operator.Evaluate(**{**values, **changes})
+    values = {"token": "operate", "key": "k", "env": "toy/line", "bundle": None, "split": "train"}
+    return operator.Evaluate(**{**values, "cases": None, **changes})
+
+
+def rescore(row: RunRow, cases: tuple[Case, ...], *indexes: int) -> operator.Rescore:
+    wanted = {"run": row.run, "submit_index": 0, "cases": cases, "indexes": indexes}
+    return operator.Rescore(token="operate", key="k", **wanted)
+
+
+def numbers_of(row: RunRow) -> tuple[int, ...]:
+    return row.budget, row.min_episodes_per_submit, row.max_episodes_per_submit
 
 
 SUBMIT = keys.gateway_key("c", "r", "submit")
@@ -111,11 +105,7 @@ OPS = keys.operator_key("c", "any")
 
 def test_run_takes_its_numbers_and_cases_from_its_suite(parser: RequestParser) -> None:
     made = event(parser, OPS, create())
-    assert (made.row.budget, made.row.min_episodes_per_submit, made.row.max_episodes_per_submit) == (
-        128,
-        1,
-        128,
-    )
+    assert numbers_of(made.row) == (128, 1, 128)
     assert (len(made.row.train), len(made.row.validation), len(made.row.heldout)) == (64, 16, 32)
     assert made.row.cases_secret
     assert len(made.row.secret) == 32
@@ -130,7 +120,7 @@ def test_run_takes_its_numbers_and_cases_from_its_suite(parser: RequestParser) -
 
 def test_run_may_ask_for_other_numbers(parser: RequestParser) -> None:
     made = event(parser, OPS, create(budget=8, n_validation=3, n_heldout=4, min_episodes_per_submit=2))
-    assert (made.row.budget, made.row.min_episodes_per_submit, made.row.max_episodes_per_submit) == (8, 2, 8)
+    assert numbers_of(made.row) == (8, 2, 8)
     usual = event(parser, OPS, create())
     assert made.row.validation == usual.row.validation[:3]
     assert made.row.heldout == usual.row.heldout[:4]
@@ -167,13 +157,11 @@ def test_run_with_impossible_settings_is_refused(
 
 def test_a_bounded_agent_report_still_closes_its_run(parser: RequestParser) -> None:
     key = keys.gateway_key("c", "r", "close")
-    for facts in ({"turns": 3}, {"turns": 3, "notes": ["x" * 1000] * 300}):
-        made = event(
-            parser, key, gateway.CloseRun(run="r", token="capable", reason="agent_stopped", agent=facts)
-        )
-        assert made.message.agent == (
-            facts if len(facts) == 1 else {"left_out": "300,917 bytes; 262,144 are the limit"}
-        )
+    small = {"turns": 3}
+    cut = {"left_out": "300,917 bytes; 262,144 are the limit"}
+    for facts, kept in ((small, small), ({"turns": 3, "notes": ["x" * 1000] * 300}, cut)):
+        close = gateway.CloseRun(run="r", token="capable", reason="agent_stopped", agent=facts)
+        assert event(parser, key, close).message.agent == kept
 
 
 def test_a_close_reason_fits_into_the_message_of_the_runs_end(parser: RequestParser) -> None:
@@ -242,9 +230,8 @@ def test_results_must_hold_or_have_stored_the_blobs_they_name(
 ) -> None:
     key = keys.worker_key("c", "done")
     data = b"trajectory"
-    assert event(parser, key, report_results(trajectory=blob(data))).message == report_results(
-        trajectory=blob(data)
-    )
+    whole = report_results(trajectory=blob(data))
+    assert event(parser, key, whole).message == whole
     named = blob(data, inline=False)
     assert refused(parser, key, report_results(trajectory=named)).status == "missing_blob"
     blobs.put(data)
@@ -305,15 +292,8 @@ def test_an_oversized_blob_is_never_read(
     ],
 )
 def test_wrong_registration_is_refused(parser: RequestParser, changes: dict[str, Any], status: str) -> None:
-    values: dict[str, Any] = {
-        "worker": "w",
-        "token": "join",
-        "protocol": codec.WIRE_VERSION,
-        "slots": 1,
-        "tiers": (),
-        "environments": (),
-        "fingerprint": worker.Fingerprint(code_version="", python="", packages={}, cpu=""),
-    }
+    values: dict[str, Any] = {"worker": "w", "token": "join", "protocol": codec.WIRE_VERSION, "slots": 1}
+    values |= {"tiers": (), "environments": (), "fingerprint": fingerprint()}
     key = keys.worker_key("c", "register")
     made = event(parser, key, worker.Register(**values))
     assert len(made.session) >= 16
@@ -447,16 +427,10 @@ def test_a_rescore_takes_all_but_its_cases_from_the_run(
     with pytest.raises(RefusedError, match=f"epoch new --state {tmp_path}`"):
         parser.runs.further_cases(wanted)
 
-    message = operator.Rescore(
-        token="operate", key="k", run=row.run, submit_index=0, cases=found.cases, indexes=(1, 3)
-    )
+    message = rescore(row, found.cases, 1, 3)
     made = parser.runs.rescore(message, row, result)
-    assert (made.bundle, made.split, made.secret, made.record) == (
-        ref.digest,
-        "heldout",
-        row.secret,
-        "actions",
-    )
+    assert (made.bundle, made.split) == (ref.digest, "heldout")
+    assert (made.secret, made.record) == (row.secret, "actions")
     assert made.cases == (found.cases[1], found.cases[3])
     assert made.case_ids == (4, 6)  # after the held-out ids 0 to 2
     assert made.related == (*row.validation, *row.heldout)
@@ -485,9 +459,7 @@ def test_a_rescore_of_a_world_keeps_the_runs_key(blobs: BlobStore, parser: Reque
         return tuple(Case(seed=first_seed + n, options=each) for n, each in enumerate(given))
 
     row = msgspec.structs.replace(row, train=cases("aa", 0), validation=(), heldout=())
-    message = operator.Rescore(
-        token="operate", key="k", run=row.run, submit_index=0, cases=cases("aa", 7), indexes=(0, 1)
-    )
+    message = rescore(row, cases("aa", 7), 0, 1)
     parser.runs.rescore(message, row, result)
     with pytest.raises(ConfigError, match=f"another world than run {row.run}"):
         parser.runs.rescore(msgspec.structs.replace(message, cases=cases(wrong, 7)), row, result)
@@ -498,9 +470,7 @@ def test_a_rescore_by_policies_of_whole_submits_plays_all_cases_at_once(
 ) -> None:
     row, result = finished_pair(parser, blobs, policy_scope="submit")
     cases = tuple(Case(seed=seed) for seed in range(3))
-    message = operator.Rescore(
-        token="operate", key="k", run=row.run, submit_index=0, cases=cases, indexes=(0, 1)
-    )
+    message = rescore(row, cases, 0, 1)
     with pytest.raises(RefusedError, match="all cases are played at once"):
         parser.runs.rescore(message, row, result)
     parser.runs.rescore(msgspec.structs.replace(message, indexes=(0, 1, 2)), row, result)
@@ -519,14 +489,12 @@ def test_a_lost_run_is_opened_again_as_the_same_run(tmp_path: Path) -> None:
     state, restored, other = (tmp_path / name for name in ("state", "restored", "other"))
     row = opened(state, create())
     shutil.copytree(state, restored)
-    again = opened(restored, msgspec.structs.replace(create(), run=row.run))
-    assert again == row
+    asked = msgspec.structs.replace(create(), run=row.run)
+    assert opened(restored, asked) == row
     assert opened(state, msgspec.structs.replace(create(), key="k2")).run != row.run
     stranger = opened(other, create())
-    assert {row.run, row.capability, row.salt, row.secret}.isdisjoint(
-        {stranger.run, stranger.capability, stranger.salt, stranger.secret}
-    )
-    asked = msgspec.structs.replace(create(), run=row.run)
+    theirs = {stranger.run, stranger.capability, stranger.salt, stranger.secret}
+    assert theirs.isdisjoint({row.run, row.capability, row.salt, row.secret})
     assert refused(make_parser(other), OPS, asked).status == "unknown_run"
 
 

@@ -11,7 +11,6 @@ import time
 from pathlib import Path
 from typing import Any
 
-import msgspec
 import pytest
 import structlog
 from rigs.service_world import Requested, World, register, started
@@ -19,7 +18,6 @@ from structlog.testing import capture_logs
 
 from evopolicy_common.errors import DamagedStoreError, LeadLostError, PartFailedError
 from evopolicy_common.messages import gateway, operator, worker
-from evopolicy_common.messages.run_settings import RunSettings
 from evopolicy_common.messages.status import StatusRequest
 from evopolicy_common.records.blobs import digest_of
 from evopolicy_common.wire import keys
@@ -28,6 +26,15 @@ from evopolicy_coordinator.core.machine import Core
 from evopolicy_coordinator.server import core_host, process, service
 from evopolicy_coordinator.storage.store import Store
 from evopolicy_coordinator.web.content.remarks import abandoned
+
+
+def failing(error: Exception) -> Any:
+    """What stands in the place of a function and fails."""
+
+    def broken(*_: Any) -> Any:
+        raise error
+
+    return broken
 
 
 async def test_all_events_of_a_tick_share_one_write(tmp_path: Path) -> None:
@@ -53,8 +60,6 @@ async def test_what_was_answered_is_there_after_a_restart(tmp_path: Path) -> Non
 
 
 async def test_an_unwritten_request_did_not_happen_and_may_be_repeated(tmp_path: Path) -> None:
-    async def asked_again(world: World, created: operator.RunCreated) -> Any:
-        return await world.answer(world.submit(created, "key"))
 
     async with started(tmp_path) as world:
         created = await world.create()
@@ -67,16 +72,13 @@ async def test_an_unwritten_request_did_not_happen_and_may_be_repeated(tmp_path:
         assert refused.status == "unavailable"
         assert "cannot write its store" in refused.message
         assert "disk is full" not in refused.message
-        settings = RunSettings(env="toy/line", entry="e", model="m", exp_id="x")
-        creating = Requested(
-            keys.operator_key("c", "create"),
-            operator.CreateRun(token="operate", key="other", settings=settings),
-        )
-        assert "disk is full" in (await world.answer(creating)).message
+        assert "disk is full" in (await world.answer(world.creating("other"))).message
         world.full = False
-        while (answer := await asked_again(world, created)) is None or isinstance(answer, worker.Refused):
+        while not isinstance(
+            answer := await world.answer(world.submit(created, "key")), gateway.SubmitAccepted
+        ):
+            assert answer is None or isinstance(answer, worker.Refused)
             await asyncio.sleep(0.02)
-        assert isinstance(answer, gateway.SubmitAccepted)
         assert answer.submit_index == 0
         assert answer.remaining_budget == 98
 
@@ -110,16 +112,12 @@ async def test_operators_are_answered_while_the_store_cannot_write(tmp_path: Pat
         world.full = True
         assert await world.answer(world.submit(created, "key")) is None
         asked = Requested(keys.operator_key("c", "status"), StatusRequest(token="operate"))
-        wait = operator.WaitRun(token="operate", run=created.run, wait_s=0.0)
-        following = Requested(keys.operator_key("c", "wait"), wait)
+        following = world.waiting(created.run, 0.0)
         stranger = Requested(keys.operator_key("c", "status"), StatusRequest(token="guessed"))
         world.ask(asked, following, stranger)
         status, progress = await asked.message(), await following.message()
-        for answer in (status, progress):
-            assert (
-                "cannot write its store and accepts no changes until it can: database or disk"
-                in answer.trouble
-            )
+        trouble = "cannot write its store and accepts no changes until it can: database or disk"
+        assert all(trouble in answer.trouble for answer in (status, progress))
         assert [run.run for run in status.runs] == [created.run]
         assert (progress.phase, progress.total) == ("open", 100)
         assert isinstance(await stranger.message(), worker.Refused)
@@ -168,8 +166,7 @@ async def test_core_that_fails_is_loaded_anew_and_others_are_served_on(
 async def test_stopping_answers_what_was_handled_and_ends_every_wait(tmp_path: Path) -> None:
     async with started(tmp_path) as world:
         created = await world.create()
-        wait = operator.WaitRun(token="operate", run=created.run, wait_s=60)
-        waiting = Requested(keys.operator_key("c", "wait"), wait)
+        waiting = world.waiting(created.run, 60)
         accepted = world.submit(created, "key")
         world.ask(waiting, accepted)
         await world.service.stop()
@@ -190,9 +187,7 @@ async def test_a_stuck_disk_is_named_in_status_and_log(
             write(rows)
 
         world.store.write = hanging  # type: ignore[method-assign]
-        settings = RunSettings(env="toy/line", entry="e", model="m", exp_id="x")
-        create = operator.CreateRun(token="operate", key="k", settings=settings)
-        created = Requested(keys.operator_key("c", "create"), create)
+        created = world.creating()
         world.ask(created)
         stalls: tuple[str, ...] = ()
         while not stalls:
@@ -234,11 +229,9 @@ async def test_the_status_tells_of_the_disk(tmp_path: Path) -> None:
 
 async def test_long_poll_ends_by_itself(tmp_path: Path) -> None:
     async with started(tmp_path) as world:
-        registering = register(world)
-        session = (await registering.message()).session
-        polling = Requested(
-            keys.worker_key("c", "lease"), worker.LeaseRequest(worker="w", session=session, n=1, wait_s=0.05)
-        )
+        session = (await register(world).message()).session
+        request = worker.LeaseRequest(worker="w", session=session, n=1, wait_s=0.05)
+        polling = Requested(keys.worker_key("c", "lease"), request)
         assert await world.answer(polling) == worker.Leases(leases=())
 
 
@@ -265,15 +258,7 @@ async def test_a_poll_given_up_during_a_blocked_loop_gets_no_lease(tmp_path: Pat
         stale.arrived -= 12.0
         bundle = world.blobs.put(b"a bundle")
         world.uploads.note(created.run, bundle)
-        submit = gateway.Submit(
-            run=created.run,
-            token=created.capability,
-            key="k",
-            env_instances=(0,),
-            bundle=bundle,
-            bundle_error=None,
-        )
-        world.ask(Requested(keys.gateway_key("c", created.run, "submit"), submit), stale, fresh)
+        world.ask(world.submit(created, "k", env_instances=(0,), bundle=bundle), stale, fresh)
         assert await stale.message() == worker.Leases(leases=())
         assert len((await fresh.message()).leases) == 1
 
@@ -290,11 +275,7 @@ async def test_an_unloadable_state_ends_the_service_with_the_reason(
 ) -> None:
     async with started(tmp_path) as world:
         created = await world.create()
-
-        def broken(*_: Any) -> Any:
-            raise KeyError("a row that is not there")
-
-        monkeypatch.setattr(Core, "load", broken)
+        monkeypatch.setattr(Core, "load", failing(KeyError("a row that is not there")))
         world.full = True
         world.ask(world.submit(created, "key"))
         assert await failed(world) == "loading the state failed: KeyError: 'a row that is not there'"
@@ -305,10 +286,7 @@ async def test_an_unloadable_state_ends_the_service_with_the_reason(
 async def test_a_state_that_cannot_be_loaded_at_the_start_is_reported(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def broken(*_: Any) -> Any:
-        raise KeyError("a row that is not there")
-
-    monkeypatch.setattr(Core, "load", broken)
+    monkeypatch.setattr(Core, "load", failing(KeyError("a row that is not there")))
     with pytest.raises(PartFailedError, match="loading the state failed: KeyError"):
         async with started(tmp_path):
             pass
@@ -324,19 +302,16 @@ async def test_a_core_failing_after_each_load_ends_the_service(
         loads.append(time.monotonic())
         return load(*args)
 
-    def broken(*_: Any) -> Any:
-        raise ZeroDivisionError("planted")
-
     monkeypatch.setattr(core_host, "_LONGEST_PAUSE_S", 0.2)
     monkeypatch.setattr(Core, "load", counted)
     async with started(tmp_path) as world:
         created = await world.create()
-        monkeypatch.setattr(Core, "handle", broken)
-        failing = asyncio.create_task(failed(world))
-        while not failing.done():
+        monkeypatch.setattr(Core, "handle", failing(ZeroDivisionError("planted")))
+        ending = asyncio.create_task(failed(world))
+        while not ending.done():
             world.ask(world.state(created))
             await asyncio.sleep(0.01)
-        assert await failing == "the core, 6 times in a row, failed: ZeroDivisionError: planted"
+        assert await ending == "the core, 6 times in a row, failed: ZeroDivisionError: planted"
         assert len(loads) == 1 + 5
 
 
@@ -368,16 +343,13 @@ async def test_a_row_that_the_store_refuses_ends_the_service(
     monkeypatch.setattr(core_host, "_LONGEST_PAUSE_S", 0.2)
     async with started(tmp_path) as world:
         created = await world.create()
-
-        def contradicts(rows: Any) -> None:
-            raise DamagedStoreError("refuses a row that contradicts another")
-
-        world.store.write = contradicts  # type: ignore[method-assign]
-        failing = asyncio.create_task(failed(world))
-        while not failing.done():
+        refusal = DamagedStoreError("refuses a row that contradicts another")
+        world.store.write = failing(refusal)  # type: ignore[method-assign]
+        ending = asyncio.create_task(failed(world))
+        while not ending.done():
             world.ask(world.submit(created, "key"))
             await asyncio.sleep(0.01)
-        assert "refuses a row that contradicts another" in await failing
+        assert "refuses a row that contradicts another" in await ending
 
 
 async def test_an_unreadable_row_ends_the_service_with_the_remedy(tmp_path: Path) -> None:
@@ -405,9 +377,8 @@ async def test_a_request_for_unreadable_data_is_refused_and_others_served(tmp_pa
         assert isinstance(await submitted.message(), gateway.SubmitAccepted)
         with contextlib.closing(sqlite3.connect(tmp_path / "db")) as db, db:
             db.execute("UPDATE submits SET data = x'00'")
-        message = gateway.ResultsRequest(
-            run=created.run, token=created.capability, submit_index=0, cursor=0, wait_s=1.0
-        )
+        known = {"run": created.run, "token": created.capability}
+        message = gateway.ResultsRequest(**known, submit_index=0, cursor=0, wait_s=1.0)
         refused = await world.answer(Requested(keys.gateway_key("c", created.run, "results"), message))
         assert refused.status == "damaged"
         assert str(tmp_path) not in refused.message
@@ -430,11 +401,7 @@ async def test_the_process_ends_when_its_service_cannot_go_on(tmp_path: Path) ->
 async def test_a_bug_in_the_writers_thread_ends_the_service_with_the_reason(tmp_path: Path) -> None:
     async with started(tmp_path) as world:
         created = await world.create()
-
-        def broken(rows: Any) -> None:
-            raise TypeError("no such row")
-
-        world.store.write = broken  # type: ignore[method-assign]
+        world.store.write = failing(TypeError("no such row"))  # type: ignore[method-assign]
         asked = world.submit(created, "key")
         world.ask(asked)
         assert await failed(world) == "writing the store failed: TypeError: no such row"
@@ -446,11 +413,7 @@ async def test_a_timer_that_cannot_be_set_ends_the_service_with_the_reason(
 ) -> None:
     async with started(tmp_path) as world:
         created = await world.create()
-
-        def broken(self: Core) -> float:
-            raise ZeroDivisionError("no deadline")
-
-        monkeypatch.setattr(Core, "next_deadline", broken)
+        monkeypatch.setattr(Core, "next_deadline", failing(ZeroDivisionError("no deadline")))
         world.ask(world.submit(created, "key"))
         assert await failed(world) == "the outbox failed: ZeroDivisionError: no deadline"
 
@@ -486,23 +449,15 @@ async def test_uploads_that_no_submit_named_are_deleted_once_their_run_is_over(
 
         async def put(created: operator.RunCreated, data: bytes, part: slice = slice(None)) -> None:
             size, sent = len(data), data[part]
-            message = worker.BlobPut(
-                sender=created.run,
-                token=created.capability,
-                digest=digest_of(data),
-                size=size,
-                offset=0,
-                data=sent,
-            )
+            known = {"sender": created.run, "token": created.capability, "digest": digest_of(data)}
+            message = worker.BlobPut(**known, size=size, offset=0, data=sent)
             asked = Requested(keys.gateway_key("c", created.run, "blob"), message)
             assert (await world.answer(asked)).have == len(sent)
 
         kept_before = b"stored before by someone else"
         world.blobs.put(kept_before)
-        for data in (
-            *(b"left behind", b"named", b"in both runs", b"brought again", b"stored again"),
-            kept_before,
-        ):
+        in_use = (b"named", b"in both runs", b"brought again", b"stored again", kept_before)
+        for data in (b"left behind", *in_use):
             await put(one, data)
         await put(other, b"in both runs")
         await put(other, b"left behind in an open run")
@@ -510,27 +465,13 @@ async def test_uploads_that_no_submit_named_are_deleted_once_their_run_is_over(
         # As by an operator or a worker that refers to it from then on.
         world.blobs.append_chunk("ops/operator", digest_of(b"brought again"), 13, 0, b"brought again")
         world.blobs.put(b"stored again")
-        named = msgspec.structs.replace(
-            gateway.Submit(run=one.run, token=one.capability, key="k", env_instances=(0, 1), bundle=None),
-            bundle=digest_of(b"named"),
-        )
-        submitted = Requested(keys.gateway_key("c", one.run, "submit"), named)
+        submitted = world.submit(one, "k", bundle=digest_of(b"named"))
         assert isinstance(await world.answer(submitted), gateway.SubmitAccepted)
-        cancelled = Requested(
-            keys.operator_key("c", "cancel"), operator.CancelRun(token="operate", run=one.run)
-        )
-        await world.answer(cancelled)
+        await world.answer(world.cancelling(one.run))
         async with asyncio.timeout(20):
             while world.blobs.has(digest_of(b"left behind")) or list((tmp_path / "blobs/parts").iterdir()):
                 await asyncio.sleep(0.02)
-        in_use = (
-            b"named",
-            b"in both runs",
-            b"brought again",
-            b"stored again",
-            kept_before,
-            b"left behind in an open run",
-        )
-        assert all(world.blobs.read_blob(digest_of(data)) == data for data in in_use)
+        for data in (*in_use, b"left behind in an open run"):
+            assert world.blobs.read_blob(digest_of(data)) == data
         assert world.uploads.has_sent(other.run, digest_of(b"in both runs"))
         assert not world.uploads.has_sent(one.run, digest_of(b"named"))

@@ -17,8 +17,8 @@ import msgspec
 import pytest
 from rigs.service_world import Requested, World, started
 
-from evopolicy_common.messages import gateway, operator
-from evopolicy_common.messages.run_settings import Line, RunSettings, Start
+from evopolicy_common.messages import gateway
+from evopolicy_common.messages.run_settings import Line, Start
 from evopolicy_common.messages.worker import Refused
 from evopolicy_common.records import journal
 from evopolicy_common.wire import keys
@@ -30,10 +30,7 @@ TREE = "ab" * 32
 
 
 async def create(world: World, key: str, start: Start | None = None, **settings: Any) -> Any:
-    known = {"env": "toy/line", "entry": "e", "model": "m", "exp_id": "x", "budget": 100, **settings}
-    wanted = RunSettings(**known, start=start)
-    message = operator.CreateRun(token="operate", key=key, settings=wanted)
-    return await world.answer(Requested(keys.operator_key("c", "create"), message))
+    return await world.answer(world.creating(key, start=start, **settings))
 
 
 async def parent(
@@ -41,21 +38,9 @@ async def parent(
 ) -> Any:
     """An open run with one submit, whose workspace is recorded."""
     created = await create(world, key, start, **settings)
-    asked = world.submit(created, "submit")
-    message = gateway.Submit(
-        **{
-            **msgspec.structs.asdict(_sent(asked)),
-            "tree": tree,
-            "run": created.run,
-            "token": created.capability,
-        }
-    )
-    assert isinstance(await world.answer(Requested(asked.key, message)), gateway.SubmitAccepted)
+    accepted = await world.answer(world.submit(created, "submit", tree=tree))
+    assert isinstance(accepted, gateway.SubmitAccepted)
     return created
-
-
-def _sent(asked: Requested) -> gateway.Submit:
-    return msgspec.msgpack.decode(asked.payload, type=gateway.Submit)
 
 
 def run_of(world: World, created: Any) -> Run:

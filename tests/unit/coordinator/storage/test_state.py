@@ -173,22 +173,10 @@ def test_port_0_becomes_a_free_port() -> None:
     assert resolve_listen(["tcp/[::1]:7447", "tls/host:1"]) == ("tcp/[::1]:7447", "tls/host:1")
 
 
-@pytest.mark.parametrize(
-    "endpoint",
-    [
-        "",
-        *[
-            "7447",
-            "tcp",
-            "tcp/host",
-            "tcp/:7447",
-            "tcp/host:x",
-            "tcp/host:70000",
-            "udp/host:1",
-            "tcp/no.such.host.invalid:0",
-        ],
-    ],
-)
+WRONG = ("", "7447", "tcp", "tcp/host", "tcp/:7447", "tcp/host:x", "tcp/host:70000", "udp/host:1")
+
+
+@pytest.mark.parametrize("endpoint", [*WRONG, "tcp/no.such.host.invalid:0"])
 def test_endpoint_that_cannot_be_listened_on_is_reported(endpoint: str) -> None:
     with pytest.raises(ConfigError, match="--listen"):
         resolve_listen([endpoint])

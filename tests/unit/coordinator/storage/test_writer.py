@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import threading
-from collections.abc import Callable
+from collections.abc import AsyncIterator
 from pathlib import Path
 
 import pytest
@@ -61,23 +62,19 @@ class World:
         self.store.close()
 
 
-def play(path: Path, scenario: Callable[[World], object]) -> World:
-    async def run() -> World:
-        world = World(path)
-        try:
-            result = scenario(world)
-            if asyncio.iscoroutine(result):
-                await result
-            await world.settle()
-            return world
-        finally:
-            await world.close()
-
-    return asyncio.run(run())
+@contextlib.asynccontextmanager
+async def world_at(path: Path) -> AsyncIterator[World]:
+    """All that is put out is carried out at the end."""
+    world = World(path)
+    try:
+        yield world
+        await world.settle()
+    finally:
+        await world.close()
 
 
-def test_effect_behind_a_persist_waits_until_it_is_durable(tmp_path: Path) -> None:
-    async def scenario(world: World) -> None:
+async def test_effect_behind_a_persist_waits_until_it_is_durable(tmp_path: Path) -> None:
+    async with world_at(tmp_path / "db") as world:
         world.hold()
         world.outbox.put([tell(0), persist(1), tell(1)])
         world.outbox.flush()
@@ -87,24 +84,20 @@ def test_effect_behind_a_persist_waits_until_it_is_durable(tmp_path: Path) -> No
         assert world.out == [tell(0), tell(1)]
         assert world.durable_when_out[1] == {"r-1"}
 
-    play(tmp_path / "db", scenario)
 
-
-def test_what_comes_while_a_write_is_under_way_shares_the_next_one(tmp_path: Path) -> None:
-    async def scenario(world: World) -> None:
+async def test_what_comes_while_a_write_is_under_way_shares_the_next_one(tmp_path: Path) -> None:
+    async with world_at(tmp_path / "db") as world:
         world.hold()
         for number in range(100):
             world.outbox.put([persist(number), tell(number)])
             world.outbox.flush()
         world.gate.set()
-
-    world = play(tmp_path / "db", scenario)
     assert world.out == [tell(number) for number in range(100)]
     assert world.outbox.commits == 2
 
 
-def test_failed_write_stops_everything_behind_it(tmp_path: Path) -> None:
-    async def scenario(world: World) -> None:
+async def test_failed_write_stops_everything_behind_it(tmp_path: Path) -> None:
+    async with world_at(tmp_path / "db") as world:
         world.outbox.put([persist(0), tell(0)])
         world.outbox.flush()
         await world.settle()
@@ -118,14 +111,12 @@ def test_failed_write_stops_everything_behind_it(tmp_path: Path) -> None:
         assert len(world.failures) == 1
         assert world.runs() == {"r-0"}
 
-    play(tmp_path / "db", scenario)
 
-
-def test_a_bug_in_a_write_is_reported_and_the_thread_goes_on(tmp_path: Path) -> None:
+async def test_a_bug_in_a_write_is_reported_and_the_thread_goes_on(tmp_path: Path) -> None:
     def breaks(store: Store) -> None:
         raise LookupError("a bug")
 
-    async def scenario(world: World) -> None:
+    async with world_at(tmp_path / "db") as world:
         world.outbox.put([Persist(rows=(object(),)), tell(0)])  # type: ignore[arg-type]
         world.outbox.flush()
         await world.settle()
@@ -136,26 +127,18 @@ def test_a_bug_in_a_write_is_reported_and_the_thread_goes_on(tmp_path: Path) -> 
             await world.writer.call(breaks)
         assert await world.writer.call(lambda store: 7) == 7
 
-    play(tmp_path / "db", scenario)
 
-
-def test_discarded_outbox_carries_out_nothing_more(tmp_path: Path) -> None:
-    async def scenario(world: World) -> None:
-        world.hold()
-        world.outbox.put([persist(0), tell(0)])
-        world.outbox.flush()
-        world.outbox.discard()
-        world.gate.set()
-        await world.writer.call(lambda store: None)
-        assert world.out == []
-        assert world.failures == []
-
-    async def run() -> None:
-        world = World(tmp_path / "db")
-        await scenario(world)
-        await world.close()
-
-    asyncio.run(run())
+async def test_discarded_outbox_carries_out_nothing_more(tmp_path: Path) -> None:
+    world = World(tmp_path / "db")
+    world.hold()
+    world.outbox.put([persist(0), tell(0)])
+    world.outbox.flush()
+    world.outbox.discard()
+    world.gate.set()
+    await world.writer.call(lambda store: None)
+    assert world.out == []
+    assert world.failures == []
+    await world.close()
 
 
 @settings(max_examples=30, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
@@ -166,19 +149,18 @@ def test_effects_come_out_in_order_and_never_ahead_of_their_rows(
     path = tmp_path_factory.mktemp("outbox") / "db"
     effects: list[Effect] = []
 
-    async def scenario(world: World) -> None:
-        for tick in ticks:
-            made = [
-                persist(len(effects) + i) if durable else tell(len(effects) + i)
-                for i, durable in enumerate(tick)
-            ]
-            effects.extend(made)
-            world.outbox.put(made)
-            world.outbox.flush()
-            if data.draw(st.booleans()):
-                await asyncio.sleep(0)
+    async def scenario() -> World:
+        async with world_at(path) as world:
+            for tick in ticks:
+                made = [(persist if durable else tell)(len(effects) + i) for i, durable in enumerate(tick)]
+                effects.extend(made)
+                world.outbox.put(made)
+                world.outbox.flush()
+                if data.draw(st.booleans()):
+                    await asyncio.sleep(0)
+        return world
 
-    world = play(path, scenario)
+    world = asyncio.run(scenario())
     assert world.out == [effect for effect in effects if isinstance(effect, Log)]
     for effect, durable in zip(world.out, world.durable_when_out, strict=True):
         needed = {
