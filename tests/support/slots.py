@@ -19,6 +19,7 @@ from evopolicy_common.messages.episode import (
     EpisodeOutcome,
     EpisodeSpec,
     Job,
+    PolicyFailure,
     ResourceLimits,
     Tier,
 )
@@ -30,15 +31,8 @@ from evopolicy_worker.slots.slot import Slot
 
 T = TypeVar("T")
 
-QUICK = ResourceLimits(
-    episode_wall_s=20.0,
-    act_wall_s=2.0,
-    init_wall_s=10.0,
-    cpu_s=10.0,
-    memory_bytes=256 << 20,
-    processes=8,
-    file_bytes=4 << 20,
-)
+_TIMES = {"episode_wall_s": 20.0, "act_wall_s": 2.0, "init_wall_s": 10.0, "cpu_s": 10.0}
+QUICK = ResourceLimits(**_TIMES, memory_bytes=256 << 20, processes=8, file_bytes=4 << 20)
 """Limits that a test can wait for."""
 
 HONEST = """
@@ -189,13 +183,8 @@ def make_job(
         )
         for k in range(n)
     )
-    meta = {
-        "env": env,
-        "submit_index": 3,
-        "n_episodes_this_submit": n,
-        "remaining_budget_after": 5,
-        "max_episode_steps": 60,
-    }
+    meta = {"env": env, "submit_index": 3, "n_episodes_this_submit": n}
+    meta |= {"remaining_budget_after": 5, "max_episode_steps": 60}
     return Job(
         job_id="job", env=env, bundle=bundle, episodes=episodes, env_meta=meta, limits=limits, **options
     )
@@ -211,6 +200,12 @@ def rows(outcome: EpisodeOutcome) -> list[Row]:
 def category_of(outcome: EpisodeOutcome) -> str | None:
     """The category of the policy's failure; None without one."""
     return None if outcome.failure is None else outcome.failure.category
+
+
+def failure_of(outcome: EpisodeOutcome) -> PolicyFailure:
+    """The policy's failure, which has to be there."""
+    assert outcome.failure is not None
+    return outcome.failure
 
 
 def going_on(job: Job, slot: Slot) -> Job:

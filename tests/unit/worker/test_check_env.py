@@ -19,15 +19,15 @@ from evopolicy_worker.environments.checks.conformance import CheckResult
 CARTPOLE, PENDULUM = "gymnasium/CartPole-v1", "gymnasium/Pendulum-v1"
 
 
-def checked(env: str, *, memory_mb: int = 100, fault: str = "") -> Checked:
+def checked(env: str, memory_mb: int, fault: str = "") -> Checked:
     played = CheckResult(env=env, digest="d", fresh=True, reused=True)
     return Checked(played, played, InASlot(memory_mb=memory_mb, fault=fault))
 
 
 def test_a_slot_that_needs_too_much_memory_is_a_fault() -> None:
-    assert checked(CARTPOLE, memory_mb=MOST_MEMORY_MB).verdict == "ok"
-    assert checked(CARTPOLE, memory_mb=601).verdict == "its slot needs 601 MB; 600 are the limit"
-    both = checked(CARTPOLE, memory_mb=601, fault="in a slot: no")
+    assert checked(CARTPOLE, MOST_MEMORY_MB).verdict == "ok"
+    assert checked(CARTPOLE, 601).verdict == "its slot needs 601 MB; 600 are the limit"
+    both = checked(CARTPOLE, 601, fault="in a slot: no")
     assert both.verdict == "in a slot: no; its slot needs 601 MB; 600 are the limit"
 
 

@@ -107,15 +107,9 @@ def test_a_browser_that_is_missing_is_all_that_is_named(monkeypatch: pytest.Monk
 def test_a_package_index_that_cannot_be_reached_is_reported(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for name, value in {
-        "INDEX_URL": "http://127.0.0.1:9/simple",
-        "RETRIES": "0",
-        "EXTRA_INDEX_URL": "",
-        "FIND_LINKS": "",
-        "CONFIG_FILE": "/dev/null",
-    }.items():
+    settings = {"INDEX_URL": "http://127.0.0.1:9/simple", "EXTRA_INDEX_URL": "", "FIND_LINKS": ""}
+    for name, value in (settings | {"RETRIES": "0", "CONFIG_FILE": "/dev/null", "NO_CACHE_DIR": "1"}).items():
         monkeypatch.setenv(f"PIP_{name}", value)
-    monkeypatch.setenv("PIP_NO_CACHE_DIR", "1")
     assert "minigrid cannot be installed: ERROR: " in refused("minigrid")
     found = installs.read_made(tmp_path / "installs" / "minigrid")
     assert found is not None

@@ -15,20 +15,10 @@ from evopolicy_worker.environments import compile_actions
 FOUR = {"type": "Discrete", "n": 4}
 SHIFTED = {"type": "Discrete", "n": 3, "start": -1}
 BOX = {"type": "Box", "shape": [3], "dtype": "float32", "low": [-1.0, 0.0, 0.0], "high": [1.0, 1.0, 1.0]}
-MATRIX = {
-    "type": "Box",
-    "shape": [2, 3],
-    "dtype": "float64",
-    "low": [[-1.0] * 3] * 2,
-    "high": [[1.0] * 3] * 2,
-}
-OPEN = {
-    "type": "Box",
-    "shape": [4],
-    "dtype": "float32",
-    "low": ["-inf", 0.5, "-inf", -2.0],
-    "high": ["inf", "inf", -3.0, 2.0],
-}
+MATRIX = {"type": "Box", "shape": [2, 3], "dtype": "float64"}
+MATRIX |= {"low": [[-1.0] * 3] * 2, "high": [[1.0] * 3] * 2}
+OPEN = {"type": "Box", "shape": [4], "dtype": "float32"}
+OPEN |= {"low": ["-inf", 0.5, "-inf", -2.0], "high": ["inf", "inf", -3.0, 2.0]}
 WIDE = {"type": "Box", "shape": [40], "dtype": "float32", "low": -2.0, "high": 2.0}
 BYTES = {"type": "Box", "shape": [2], "dtype": "uint8", "low": [0, 10], "high": [255, 20]}
 LONGS = {"type": "Box", "shape": [1], "dtype": "int64", "low": [-(2**63)], "high": [2**63 - 1]}
@@ -146,9 +136,8 @@ def test_an_action_is_taken_as_it_is_meant_or_repaired_and_marked(
     action, invalid = compile_actions(space).repair(raw)
     assert invalid == marked
     if isinstance(action, np.ndarray):
-        assert action.dtype == {"MultiDiscrete": "int64", "MultiBinary": "int8"}.get(
-            space["type"], space.get("dtype")
-        )
+        kinds = {"MultiDiscrete": "int64", "MultiBinary": "int8"}
+        assert action.dtype == kinds.get(space["type"], space.get("dtype"))
         np.testing.assert_allclose(action, expected, rtol=1e-6)
     else:
         assert (action, type(action)) == (expected, type(expected))

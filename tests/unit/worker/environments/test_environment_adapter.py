@@ -43,13 +43,8 @@ class Counter(gymnasium.Env[Any, Any]):
 
     def step(self, action: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
         self.buffer[0] += self.stride
-        return (
-            self.buffer,
-            np.float32(0.5),
-            np.bool_(False),
-            False,
-            {"seed": 1, "count": np.int64(self.buffer[0])},
-        )
+        info = {"seed": 1, "count": np.int64(self.buffer[0])}
+        return self.buffer, np.float32(0.5), np.bool_(False), False, info
 
     def close(self) -> None:
         self.closed = True
@@ -179,9 +174,8 @@ def test_every_shipped_environment_has_an_adapter_and_is_offered() -> None:
     assert "environment 'gym/none' is not installed" in registry.missing("gym/none")
     with pytest.raises(ConfigError) as told:
         registry.check_played(["toy/line", "vizdoom/VizdoomBasic-v1"])
-    assert str(told.value).startswith(
-        "environment 'vizdoom/VizdoomBasic-v1' is not installed; near: gymnasium/Viz"
-    )
+    start = "environment 'vizdoom/VizdoomBasic-v1' is not installed; near: gymnasium/Viz"
+    assert str(told.value).startswith(start)
     assert str(told.value).count("vizdoom/VizdoomBasic-v1") == 1
 
 
@@ -213,7 +207,6 @@ def test_only_what_plays_an_environment_is_in_its_adapters_digest(monkeypatch: p
     monkeypatch.setattr(Path, "read_bytes", noted)
     fingerprint._digest.cache_clear()
     fingerprint.adapter(type(box2d.FAMILY), 1, "CarRacing-v3")
-    assert {"box2d.py", "loop.py", "policy_server.py", "car_racing_road.py", "gymnasium_adapter.py"} <= set(
-        read
-    )
+    plays = {"box2d.py", "loop.py", "policy_server.py", "car_racing_road.py", "gymnasium_adapter.py"}
+    assert plays <= set(read)
     assert not {"mujoco.py", "registry.py", "highway_lanes.py", "table.py"} & set(read)

@@ -13,13 +13,9 @@ from evopolicy_common.messages.environment import SpaceSchema
 from evopolicy_worker.environments.interface.spaces import bounds, compile_observation, obs_storage, to_schema
 
 FLOATS: dict[str, Any] = {"type": "Box", "dtype": "float32"}
-IMAGE = {
-    "type": "Image",
-    "dtype": "uint8",
-    "layout": "height_width_channels",
-    "value_range": [0, 255],
-    "storage": "external",
-}
+DOUBLES = FLOATS | {"dtype": "float64"}
+IMAGE = {"type": "Image", "dtype": "uint8", "layout": "height_width_channels"}
+IMAGE |= {"value_range": [0, 255], "storage": "external"}
 
 
 def pixels(*shape: int) -> spaces.Space[Any]:
@@ -49,13 +45,7 @@ def pixels(*shape: int) -> spaces.Space[Any]:
         (spaces.Box(-np.inf, 1, (33,)), {**FLOATS, "shape": [33], "low": "-inf", "high": 1.0}),
         (
             spaces.Box(np.arange(40.0) - 50, np.full(40, np.inf), dtype=np.float64),
-            {
-                "type": "Box",
-                "shape": [40],
-                "dtype": "float64",
-                "low": [k - 50.0 for k in range(40)],
-                "high": "inf",
-            },
+            DOUBLES | {"shape": [40], "low": [k - 50.0 for k in range(40)], "high": "inf"},
         ),
         (pixels(7, 7, 3), {"type": "Box", "shape": [7, 7, 3], "dtype": "uint8", "low": 0, "high": 255}),
         *((pixels(*shape), {**IMAGE, "shape": list(shape)}) for shape in ((96, 96, 3), (16, 16, 1))),
@@ -131,22 +121,11 @@ def test_a_space_without_a_form_is_refused(space: spaces.Space[Any], why: str) -
 
 
 def test_observations_become_plain_in_the_order_and_dtypes_of_the_space() -> None:
-    space = spaces.Dict(
-        {
-            "z": spaces.Box(-1, 1, (2,), np.float32),
-            "a": spaces.Discrete(5),
-            "m": spaces.Text(9),
-            "t": spaces.Tuple([spaces.MultiBinary(2), spaces.MultiDiscrete([3, 3])]),
-        }
-    )
-    convert = compile_observation(to_schema(space))
-    raw: dict[str, Any] = {
-        "t": (np.ones(2, "int32"), [1, 2]),
-        "m": np.str_("go"),
-        "a": np.int64(3),
-        "z": np.array([0.5, 1.0], dtype=np.float64),
-    }
-    obs = convert(raw)
+    parts = {"z": spaces.Box(-1, 1, (2,), np.float32), "a": spaces.Discrete(5), "m": spaces.Text(9)}
+    parts["t"] = spaces.Tuple([spaces.MultiBinary(2), spaces.MultiDiscrete([3, 3])])
+    convert = compile_observation(to_schema(spaces.Dict(parts)))
+    raw: dict[str, Any] = {"t": (np.ones(2, "int32"), [1, 2]), "m": np.str_("go"), "a": np.int64(3)}
+    obs = convert(raw | {"z": np.array([0.5, 1.0], dtype=np.float64)})
     assert list(obs) == ["a", "m", "t", "z"]
     assert (type(obs["a"]), type(obs["m"]), type(obs["t"])) == (int, str, tuple)
     assert (obs["z"].dtype, obs["t"][0].dtype, obs["t"][1].dtype) == (np.float32, np.int8, np.int64)

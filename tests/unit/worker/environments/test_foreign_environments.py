@@ -57,21 +57,12 @@ def test_an_environment_without_a_limit_gets_the_usual_one() -> None:
 
 
 def test_a_definition_sets_arguments_wrappers_limit_text_and_success() -> None:
-    more = {
-        "kwargs": {"push": 0.9},
-        "wrappers": (Wrapper(wrapper="RescaleAction", kwargs={"min_action": -2.0, "max_action": 2.0}),),
-        "max_episode_steps": 7,
-        "task": "# Fly\u202e\x07",
-        "success": "near",
-        "title": "G",
-    }
+    rescaled = Wrapper(wrapper="RescaleAction", kwargs={"min_action": -2.0, "max_action": 2.0})
+    more = {"kwargs": {"push": 0.9}, "wrappers": (rescaled,), "max_episode_steps": 7}
+    more |= {"task": "# Fly\u202e\x07", "success": "near", "title": "G"}
     description = describe(defined("Glider", **more))
-    assert (description.max_episode_steps, description.task_text, description.success, description.title) == (
-        7,
-        "# Fly",
-        "near",
-        "G",
-    )
+    assert (description.max_episode_steps, description.task_text) == (7, "# Fly")
+    assert (description.success, description.title) == ("near", "G")
     assert description.action_space["high"] == [2.0]
     assert description.digest() != describe("acme_envs:Glider-v0").digest()
     environment = make("acme/Glider")
@@ -113,18 +104,12 @@ MISREAD = {
     "letters": "a text with 'c', which is not one of its characters",
 }
 """Observations that are not turned into ones of their space."""
+MISREADS = "environment acme/Misread, reset, observation: {}; correct"
 MADE = r"make: gymnasium.make\("
 REFUSED: list[tuple[str, dict[str, Any], str]] = [
     *(("Glider", {"wrappers": (Wrapper(wrapper=wrapper),)}, why) for wrapper, why in WRAPPERS.items()),
     *(("Bad", {"kwargs": {"how": how}}, why) for how, why in BAD.items()),
-    *(
-        (
-            "Misread",
-            {"kwargs": {"what": what}},
-            f"environment acme/Misread, reset, observation: {why}; correct",
-        )
-        for what, why in MISREAD.items()
-    ),
+    *(("Misread", {"kwargs": {"what": what}}, MISREADS.format(why)) for what, why in MISREAD.items()),
     # What cannot be made, with the field to correct.
     (
         "Glider",
@@ -193,10 +178,8 @@ def test_a_reward_vector_is_recorded_whole_and_counts_by_its_weights() -> None:
 
 
 def test_a_success_is_a_number_alone() -> None:
-    assert [solved(each) for each in (True, 0.0, [1], [0.0], [], [1, 1], "False", {}, math.nan)] == [
-        *(True, False, True, False),
-        *(None, None, None, None, False),
-    ]
+    told = [solved(each) for each in (True, 0.0, [1], [0.0], [], [1, 1], "False", {}, math.nan)]
+    assert told == [True, False, True, False, None, None, None, None, False]
 
 
 @pytest.fixture

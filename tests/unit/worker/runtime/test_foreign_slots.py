@@ -9,7 +9,7 @@ from typing import Any
 
 import msgspec
 import pytest
-from slots import Slots, acting, category_of, going_on, make_job, prefix, rows
+from slots import Slots, acting, category_of, failure_of, going_on, make_job, prefix, rows
 from waiting import wait_until
 
 from evopolicy_common.catalogue import Entry
@@ -63,9 +63,7 @@ def test_a_process_that_has_played_a_hidden_episode_plays_no_train_episode(slots
         assert returned(slots, slot, "full") == 1.0
 
 
-def test_a_process_replaced_in_a_hidden_episode_plays_no_train_episode(
-    slots: Slots,
-) -> None:
+def test_a_process_replaced_in_a_hidden_episode_plays_no_train_episode(slots: Slots) -> None:
     """Attack: comes with the user (`--env my_pkg:MyEnv-v0`), remembers a hidden episode in memory or in a
     file, and lets it determine rewards of train episodes. Defence: a process that has played part of a
     hidden episode of such an environment plays no train episode; its folders are emptied."""
@@ -81,13 +79,10 @@ def test_a_process_replaced_in_a_hidden_episode_plays_no_train_episode(
 def test_an_environment_that_cannot_be_closed_plays_again(slots: Slots, how: str) -> None:
     with slots.running(slot_of(slots, "Bad", kwargs={"how": how})) as slot:
         (outcome,) = slots.play_all(PUSHES, slot=slot, env="acme/Bad", record="actions")
-        assert outcome.failure is not None
-        assert (outcome.failure.category, outcome.length) == ("killed", 8)
+        assert (failure_of(outcome).category, outcome.length) == ("killed", 8)
 
 
-def test_pages_with_own_options_have_browser_and_fonts_fingerprinted(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_pages_with_own_options_have_browser_and_fonts_fingerprinted(monkeypatch: pytest.MonkeyPatch) -> None:
     versions = {"chromium": "1.2", "fonts": "f"}
     monkeypatch.setattr(Page, "identity", lambda self: versions)
     name = "evopolicy_worker.environments.browser.registered:evopolicy/MiniWoB-v0"
@@ -203,17 +198,11 @@ def test_what_prevents_an_episode_is_reported_by_name_and_is_nobodys_result(
     monkeypatch.setattr(slot_module, "_CHECK_S", 0.5)
     monkeypatch.setattr(slot_module, "SILENT_S", 16.0)
     # Long enough for calls that return, also on a busy machine.
-    limits = (
-        Limits(call_s=8.0)
-        if how.startswith(("hang", "hold"))
-        else Limits(memory_bytes=320 << 20)
-        if how == "leak"
-        else USUAL
-    )
-    again = {"environment_faults": AGAIN} if how.startswith(("hang", "hold")) else {}
-    with slots.running(
-        slot_of(slots, "Bad", limits, kwargs={"how": how}, reward_components={"fuel": "spent"})
-    ) as slot:
+    limits, again = Limits(memory_bytes=320 << 20) if how == "leak" else USUAL, {}
+    if how.startswith(("hang", "hold")):
+        limits, again = Limits(call_s=8.0), {"environment_faults": AGAIN}
+    fuel = {"reward_components": {"fuel": "spent"}}
+    with slots.running(slot_of(slots, "Bad", limits, kwargs={"how": how}, **fuel)) as slot:
         # Also where the policy's actions come first, and random ones play the episode again.
         with pytest.raises(WorkerError, match=WRONG[how]):
             slots.play_all(PUSHES, slot=slot, env="acme/Bad", n=20 if how == "leak" else 1, **again)
@@ -247,8 +236,7 @@ def test_an_environment_that_hangs_on_actions_gives_no_second_throw(
         slots.run(slot.start())
         job = msgspec.structs.replace(job, environment_faults=AGAIN)
         (outcome,) = slots.run(slot.play_job(job, bundle, lambda *progress: None))
-        assert outcome.failure is not None
-        assert (outcome.failure.category, outcome.length) == ("killed", 8)
+        assert (failure_of(outcome).category, outcome.length) == ("killed", 8)
     finally:
         slots.run(slot.close())
 
@@ -262,15 +250,12 @@ def test_a_close_that_hangs_ends_the_process_at_the_next_episode(slots: Slots) -
         assert slots.play_all(PUSHES, slot=slot, env="acme/Bad")[0].length == 8
 
 
-def test_observations_beyond_bounds_are_played_and_the_operator_told(
-    slots: Slots,
-) -> None:
+def test_observations_beyond_bounds_are_played_and_the_operator_told(slots: Slots) -> None:
     with slots.running(slot_of(slots, "Bad", kwargs={"how": "outside"})) as slot:
         (outcome,) = slots.play_all(PUSHES, slot=slot, env="acme/Bad")
         assert (outcome.length, outcome.failure) == (8, None)
-        wait_until(
-            lambda: any("environment acme/Bad, step 0, observation: element" in each for each in slot._stderr)
-        )
+        told = "environment acme/Bad, step 0, observation: element"
+        wait_until(lambda: any(told in each for each in slot._stderr))
 
 
 @pytest.mark.parametrize("how", ["fork", "fork and wait"])
@@ -294,9 +279,7 @@ def test_memory_is_looked_at_from_outside_the_call(monkeypatch: pytest.MonkeyPat
     )
 
 
-def test_only_a_calls_running_time_counts(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_only_a_calls_running_time_counts(monkeypatch: pytest.MonkeyPatch) -> None:
     guard = Guard(Limits(call_s=5.0))
     monkeypatch.setattr(calls, "current", Call())
     call = calls.current

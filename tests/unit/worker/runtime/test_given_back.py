@@ -15,7 +15,7 @@ from typing import Any
 import msgspec
 import numpy as np
 import pytest
-from slots import HONEST, QUICK, STUCK, Slots, acting, going_on, make_job, prefix, rows
+from slots import HONEST, QUICK, STUCK, Slots, acting, failure_of, going_on, make_job, prefix, rows
 
 from evopolicy_common.errors import SlotDiedError
 from evopolicy_common.messages.episode import BlobRef, EpisodeOutcome, Job, PolicyFailure
@@ -142,8 +142,8 @@ def test_a_failure_stands_and_so_do_the_episodes_before_it(slots: Slots) -> None
     # Now it would not fail any more.
     lucky = source.replace(str(until), "0")
     outcomes = end(slots, slot, job, lucky)
-    assert outcomes[0].failure is not None
-    assert (outcomes[0].failure.category, outcomes[0].failure.step_index) == ("act_error", 4)
+    failure = failure_of(outcomes[0])
+    assert (failure.category, failure.step_index) == ("act_error", 4)
     assert actions(outcomes[0])[:4] == prefix(job, 0)
     assert actions(outcomes[1])[: len(prefix(job, 1))] == prefix(job, 1)
     assert outcomes[2].failure is None

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import json
 import math
-import os
 import struct
 from collections.abc import Iterator
 from pathlib import Path
@@ -20,7 +19,7 @@ import msgspec
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from slots import QUICK, Slots, category_of, make_job, misbehaving
+from slots import QUICK, Slots, acting, category_of, failure_of, make_job, misbehaving
 
 from evopolicy_common.errors import WorkerError
 from evopolicy_common.messages.episode import EpisodeOutcome
@@ -48,16 +47,12 @@ SPACES: list[dict[str, Any]] = [
     {"type": "MultiDiscrete", "nvec": [4, 4]},
     {"type": "MultiBinary", "n": [2, 3]},
     {"type": "Text", "min_length": 1, "max_length": 9},
-    {
-        "type": "Tuple",
-        "spaces": [
-            {"type": "Discrete", "n": 9},
-            {"type": "Dict", "spaces": {"a": {"type": "Discrete", "n": 2}}},
-        ],
-    },
 ]
+PARTS = [{"type": "Discrete", "n": 9}, {"type": "Dict", "spaces": {"a": {"type": "Discrete", "n": 2}}}]
+SPACES.append({"type": "Tuple", "spaces": PARTS})
 CODECS = [compile_actions(space) for space in SPACES]
 
+PLAYED = EpisodeOutcome(index=0, episode_return=0.0, length=1, terminated=False, truncated=True)
 NUMBERS = st.one_of(st.integers(), st.integers(10**18, 10**40), st.floats(), st.booleans(), st.none())
 VALUES: st.SearchStrategy[Any] = st.recursive(
     st.one_of(NUMBERS, st.text(max_size=8), st.binary(max_size=8)),
@@ -109,9 +104,8 @@ def test_whatever_comes_as_an_action_reaches_the_hand_in_whole(
         action, _ = CODECS[which].repair(returned)
         recorder.append(0, returned, 0.0, False, False, {})
         played.append(None, action, 0.0, False, False, {})
-    outcome = EpisodeOutcome(index=0, episode_return=0.0, length=1, terminated=False, truncated=True)
     for each in (recorder, played):
-        outcome = msgspec.structs.replace(outcome, trajectory=_blob(each.finish()))
+        outcome = msgspec.structs.replace(PLAYED, trajectory=_blob(each.finish()))
         assert results_reported(outcome) == outcome
 
 
@@ -124,9 +118,8 @@ def results_reported(outcome: EpisodeOutcome) -> EpisodeOutcome:
     """The outcome after its way from the slot's process through the supervisor to the coordinator."""
     (outcome,) = finished(messages.framed(messages.Finished(outcome=outcome)))
     result = JobResult(lease_id="l", job_id="j", attempt=1, kind="done", episodes=(outcome,))
-    message = codec.decode(
-        codec.worker_requests, codec.encode(ReportResults(worker="w", session="s", results=(result,)))
-    )
+    sent = codec.encode(ReportResults(worker="w", session="s", results=(result,)))
+    message = codec.decode(codec.worker_requests, sent)
     assert isinstance(message, ReportResults)
     return message.results[0].episodes[0]
 
@@ -165,18 +158,8 @@ def test_whatever_comes_as_a_report_is_a_bounded_failure(
     assert len(failure.message) <= 2000
     assert len(failure.traceback) <= 16_000
     assert failure.used is None or 0 <= failure.used <= 1 << 53
-    outcome = EpisodeOutcome(
-        index=0, episode_return=0.0, length=1, terminated=False, truncated=True, failure=failure
-    )
+    outcome = msgspec.structs.replace(PLAYED, failure=failure)
     assert results_reported(outcome) == outcome
-
-
-@pytest.fixture(scope="module")
-def monitor() -> Monitor:
-    commands, _never_written = os.pipe()
-    found = Monitor(commands, lambda: None, lambda: None)
-    found.start()
-    return found
 
 
 @pytest.fixture(scope="module")
@@ -304,8 +287,7 @@ def test_an_action_that_breaks_the_environment_is_the_policys_failure(
 ) -> None:
     monkeypatch.setattr(Fragile, "how", how)
     (outcome,) = play(player, slots, BREAKER)
-    failure = outcome.failure
-    assert failure is not None
+    failure = failure_of(outcome)
     assert (failure.category, failure.step_index) == ("killed", None)
     assert "the environment broke down" in failure.message
     assert "4711" not in failure.message
@@ -343,13 +325,8 @@ def test_an_environment_that_breaks_without_a_policy_is_ours(
 
 
 def test_after_a_broken_environment_the_jobs_other_episodes_go_on(player: JobPlayer, slots: Slots) -> None:
-    source = misbehaving(act="return [1.0]").replace(
-        "self.n += 1", "self.n += 1; first = getattr(self, 'e', 0) == 1"
-    )
-    source = source.replace("if self.n == 4:", "if self.n == 4 and self.e == 2:").replace(
-        "def reset(self, episode_index):",
-        "def reset(self, episode_index):\n        self.e = episode_index; self.n = 0",
-    )
+    act = "self.n += 1\nreturn [1.0 if self.n == 4 and self.e == 2 else 0.0]"
+    source = acting(act, reset="self.e, self.n = episode_index, 0")
     outcomes = play(player, slots, source, n=3, policy_scope="submit")
     assert [outcome.failure is not None for outcome in outcomes] == [False, True, False]
 
@@ -363,10 +340,9 @@ def test_an_answer_of_a_slots_process_that_is_none_is_reported(slots: Slots) -> 
         assert process is not None
         assert process.stdout is not None
         process.stdout.feed_data(messages.LENGTH.pack(3) + b"abc")
+        job = make_job(bundle=None, n=200, policy_scope="submit")
         with pytest.raises(WorkerError, match="cannot be read"):
-            await slot.play_job(
-                make_job(bundle=None, n=200, policy_scope="submit"), None, lambda *progress: None
-            )
+            await slot.play_job(job, None, lambda *progress: None)
         await slot.close()
 
     slots.run(work())

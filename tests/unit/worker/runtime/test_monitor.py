@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
+from program_runs import run_python
 
 _PROGRAM = """
 import os, time
@@ -21,6 +20,6 @@ time.sleep(60)
 
 
 def test_a_monitor_that_fails_ends_its_process_with_the_reason() -> None:
-    ended = subprocess.run([sys.executable, "-c", _PROGRAM], capture_output=True, text=True, timeout=50)
+    ended = run_python(_PROGRAM, timeout=50)
     assert ended.returncode == 1
     assert "LookupError: a bug" in ended.stderr

@@ -7,7 +7,7 @@ import sys
 import textwrap
 
 import pytest
-from slots import Slots, acting, category_of, rows
+from slots import Slots, acting, category_of, failure_of, rows
 
 NEWEST = """
     import json
@@ -93,9 +93,9 @@ def test_an_action_that_the_published_software_refuses_is_a_failure(
             return P()
     """
     outcome = slots.play(policy)
-    assert outcome.failure is not None
-    assert (outcome.failure.category, outcome.failure.step_index) == ("act_error", 0)
-    assert outcome.failure.message.startswith(message)
+    failure = failure_of(outcome)
+    assert (failure.category, failure.step_index) == ("act_error", 0)
+    assert failure.message.startswith(message)
     if "TensorValue" not in returned:
         # Found in what the policy returned: none of the sandbox's own lines are in the traceback.
         assert "programs.py" not in outcome.failure.traceback
@@ -105,8 +105,8 @@ def test_a_fault_in_make_policy_is_an_init_error(slots: Slots) -> None:
     failed = slots.play("def make_policy(context):\n    return context.nothing\n", first=0)
     assert category_of(failed) == "init_error"
     without = slots.play("def make_policy(context):\n    return object()\n", first=0)
-    assert without.failure is not None
-    assert (without.failure.category, "act" in without.failure.message) == ("init_error", True)
+    failure = failure_of(without)
+    assert (failure.category, "act" in failure.message) == ("init_error", True)
     helper = slots.play(EARLIER.replace("import numpy as np", "def make_policy(context): raise ValueError"))
     assert helper.failure is None
 
@@ -115,9 +115,9 @@ def test_a_missing_environment_parameter_is_named(slots: Slots) -> None:
     policy = "def make_policy(context):\n    return context.environment_parameters['gravity']\n"
     failed = slots.play(policy, first=0)
     assert category_of(failed) == "init_error"
-    assert failed.failure is not None
-    assert "there is no environment parameter 'gravity'" in failed.failure.message
-    assert "Gymnasium's defaults" in failed.failure.message
+    failure = failure_of(failed)
+    assert "there is no environment parameter 'gravity'" in failure.message
+    assert "Gymnasium's defaults" in failure.message
 
 
 @pytest.mark.skipif(
@@ -126,13 +126,11 @@ def test_a_missing_environment_parameter_is_named(slots: Slots) -> None:
 @pytest.mark.parametrize("line", ["type Number = float", "from typing import override"])
 def test_code_for_a_newer_python_names_the_workers(slots: Slots, line: str) -> None:
     failed = slots.play(f"{line}\n{textwrap.dedent(NEWEST)}", first=0)
-    assert failed.failure is not None
-    assert failed.failure.category == "import_error"
+    assert failure_of(failed).category == "import_error"
     own = f"this worker has Python {sys.version_info[0]}.{sys.version_info[1]}"
     assert failed.failure.message.endswith(f"({own}; policies of this form are written for Python 3.12)")
     earlier = slots.play(f"{line}\n{EARLIER}", first=0)
-    assert earlier.failure is not None
-    assert "3.12" not in earlier.failure.message
+    assert "3.12" not in failure_of(earlier).message
 
 
 def test_a_bundles_own_module_of_that_name_comes_first(slots: Slots) -> None:

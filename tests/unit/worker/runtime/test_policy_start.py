@@ -7,12 +7,12 @@ import importlib.util
 import json
 import random
 import struct
-import subprocess
 import sys
 from types import ModuleType
 
 import numpy as np
 import pytest
+from program_runs import run_python
 from slots import HONEST, Slots, acting
 
 from evopolicy_worker.sandbox.jail import INSIDE
@@ -152,8 +152,7 @@ print(sum(map(len, kept)), end < id(kept[-1]) < libc.sbrk(ctypes.c_long(0)))
 
 @pytest.mark.parametrize("room", ["free", "blocked"])
 def test_pythons_memory_extends_the_heap_only_where_there_is_room(room: str) -> None:
-    command = [sys.executable, "-c", HEAP, str(INSIDE / "zygote.py"), room]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    done = run_python(HEAP, INSIDE / "zygote.py", room)
     glibc = hasattr(ctypes.CDLL(None), "gnu_get_libc_version")
     extends = room == "free" and glibc and sys.version_info < (3, 14)
     assert (done.returncode, done.stdout) == (0, f"400000 {extends}\n"), done.stderr

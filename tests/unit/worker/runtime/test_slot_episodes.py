@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import ctypes
+import json
 import math
 import platform
 from pathlib import Path
 
 import numpy as np
 import pytest
-from slots import HONEST, Slots, acting, make_job, misbehaving, rows
+from slots import HONEST, Slots, acting, category_of, failure_of, make_job, misbehaving, rows
 
 from evopolicy_common.messages.environment import Case
 from evopolicy_common.processes.proc import descendants
@@ -54,9 +55,7 @@ def test_the_same_episode_gives_the_same_bytes_in_every_slot(slots: Slots) -> No
     other = slots.play(policy, tier="landlock")
     slots.play(HONEST)
     later = slots.play(policy)
-    assert {outcome.trajectory.digest for outcome in (first, again, other, later) if outcome.trajectory} == {
-        first.trajectory.digest if first.trajectory else None
-    }
+    assert first.trajectory == again.trajectory == other.trajectory == later.trajectory is not None
     assert first.stdout == other.stdout == later.stdout
     elsewhere = slots.play(policy, policy_seed=b"another case's..")
     assert rows(elsewhere)[0].action != rows(first)[0].action
@@ -90,33 +89,19 @@ def test_unseeded_numpy_generators_of_all_kinds_are_seeded(slots: Slots) -> None
 
 
 def test_the_policy_gets_spaces_and_env_meta_but_no_case(slots: Slots) -> None:
-    policy = """
-        import json, os, sys
-
-        class Policy:
-            def __init__(self, obs_space, action_space, env_meta):
-                print(json.dumps([obs_space, action_space, env_meta]))
-
-            def reset(self, episode_index):
-                print(json.dumps([episode_index, os.getcwd(), sys.path[0], sorted(os.environ)]))
-
-            def act(self, obs):
-                return [0.0]
-    """
-    import json
-
+    policy = acting(
+        init="print(json.dumps(spaces))",
+        reset="print(json.dumps([episode_index, os.getcwd(), sys.path[0], sorted(os.environ)]))",
+        before="import json, os, sys",
+    )
     outcome = slots.play(policy)
     built, reset = map(json.loads, outcome.stdout.decode().splitlines())
     description = environments.describe("toy/line")
     assert built[0] == description.obs_space
     assert built[1] == description.action_space
-    assert built[2] == {
-        **make_job().env_meta,
-        "obs_space": description.obs_space,
-        "action_space": description.action_space,
-        "obs_storage": "inline",
-        "reward_components": description.reward_texts,
-    }
+    told = {"obs_storage": "inline", "reward_components": description.reward_texts}
+    told |= {"obs_space": description.obs_space, "action_space": description.action_space}
+    assert built[2] == make_job().env_meta | told
     assert reset[0] == 1
     assert reset[1] == reset[2] == "/home/policy/system"
     assert reset[3] == sorted({*ENVIRONMENT, "TMPDIR"})
@@ -128,16 +113,12 @@ def test_a_policy_may_change_the_spaces_that_it_is_given(slots: Slots) -> None:
 
 
 def test_dicts_texts_and_ints_arrive_as_the_space_says(slots: Slots) -> None:
-    policy = """
-        class Policy:
-            def __init__(self, *spaces): pass
-            def reset(self, episode_index): pass
-            def act(self, obs):
-                obs["view"][0, 0] = 9  # an observation is the policy's own
-                kinds = [type(obs[key]).__name__ for key in obs]
-                return [kinds, str(obs["position"].dtype), obs["view"].shape, obs["compass"], obs["steps"]]
+    act = """
+        obs["view"][0, 0] = 9  # an observation is the policy's own
+        kinds = [type(obs[key]).__name__ for key in obs]
+        return [kinds, str(obs["position"].dtype), obs["view"].shape, obs["compass"], obs["steps"]]
     """
-    outcome = slots.play(policy, env="toy/maze")
+    outcome = slots.play(acting(act), env="toy/maze")
     for row in rows(outcome)[:3]:
         kinds, dtype, shape, compass, steps = row.action
         assert kinds == ["ndarray", "str", "ndarray", "int", "ndarray"]
@@ -180,14 +161,7 @@ def test_observations_can_be_asked_for_as_lists(slots: Slots, env: str) -> None:
     ],
 )
 def test_an_action_is_recorded_as_it_was_returned(slots: Slots, text: str, value: object) -> None:
-    policy = f"""
-import numpy as np
-class Policy:
-    def __init__(self, *spaces): pass
-    def reset(self, episode_index): pass
-    def act(self, obs): return {text}
-"""
-    outcome = slots.play(policy)
+    outcome = slots.play(acting(f"return {text}", before="import numpy as np"))
     assert outcome.failure is None
     np.testing.assert_equal(rows(outcome)[0].action, value)
 
@@ -242,43 +216,28 @@ def test_hidden_evaluation_with_scope_submit_renews_the_policy_as_told(slots: Sl
 
 
 def test_with_scope_submit_a_raising_policy_stays_and_a_dead_is_rebuilt(slots: Slots) -> None:
-    policy = """
-        import os
-
-        class Policy:
-            def __init__(self, *spaces): self.n = 0
-            def reset(self, episode_index):
-                self.n += 1
-                self.index = episode_index
-                print(self.n)
-            def act(self, obs):
-                if self.index == 1: raise ValueError("once")
-                if self.index == 2: os._exit(3)
-                return [0.0]
-    """
+    policy = acting(
+        'if self.index == 1: raise ValueError("once")\nif self.index == 2: os._exit(3)\nreturn [0.0]',
+        init="self.n = 0",
+        reset="self.n += 1; self.index = episode_index; print(self.n)",
+        before="import os",
+    )
     outcomes = slots.play_all(policy, n=4, first=0, policy_scope="submit")
-    assert [outcome.failure.category if outcome.failure else None for outcome in outcomes] == [
-        None,
-        "act_error",
-        "killed",
-        None,
-    ]
+    assert [category_of(outcome) for outcome in outcomes] == [None, "act_error", "killed", None]
     assert [outcome.stdout for outcome in outcomes] == [b"1\n", b"2\n", b"3\n", b"1\n"]
 
 
 def test_modules_and_data_of_the_bundle_are_there_and_writable(slots: Slots) -> None:
     files: dict[str, str | bytes] = {
-        "policy.py": (
-            acting(
-                init="""
-                    data = Path("data/weights.bin").read_bytes()
-                    Path("data/weights.bin").write_bytes(data + b"!")
-                    Path("/tmp/note").write_text("mine")
-                    weights = Path("data/weights.bin").read_bytes()
-                    print(GAIN, policy_server.NAME, weights, Path("/tmp/note").read_text())
-                """,
-                before="from pathlib import Path; from helpers.gains import GAIN; import policy_server",
-            )
+        "policy.py": acting(
+            init="""
+                data = Path("data/weights.bin").read_bytes()
+                Path("data/weights.bin").write_bytes(data + b"!")
+                Path("/tmp/note").write_text("mine")
+                weights = Path("data/weights.bin").read_bytes()
+                print(GAIN, policy_server.NAME, weights, Path("/tmp/note").read_text())
+            """,
+            before="from pathlib import Path; from helpers.gains import GAIN; import policy_server",
         ),
         "helpers/__init__.py": "",
         "helpers/gains.py": "GAIN = 3",
@@ -291,26 +250,22 @@ def test_modules_and_data_of_the_bundle_are_there_and_writable(slots: Slots) -> 
 
 
 def test_threads_and_numpy_work_in_the_sandbox(slots: Slots) -> None:
-    policy = """
+    imports = """
         import asyncio, concurrent.futures, datetime, hashlib, json, pickle, sqlite3, statistics, tempfile, threading
         import time
         import numpy as np
-
-        class Policy:
-            def __init__(self, *spaces):
-                pool = concurrent.futures.ThreadPoolExecutor(4)
-                sums = list(pool.map(lambda k: np.linalg.norm(np.ones((50, 50)) * k), range(8)))
-                with tempfile.TemporaryFile() as file:
-                    np.save(file, np.fft.fft(np.arange(8.0)))
-                np.linalg.svd(np.random.rand(30, 30))
-                pickle.loads(pickle.dumps(sums))
-                time.sleep(0.001)
-                print(round(sums[1]), datetime.datetime.now().year > 2000, time.tzname)
-
-            def reset(self, episode_index): pass
-            def act(self, obs): return [0.0]
     """
-    outcome = slots.play(policy)
+    init = """
+        pool = concurrent.futures.ThreadPoolExecutor(4)
+        sums = list(pool.map(lambda k: np.linalg.norm(np.ones((50, 50)) * k), range(8)))
+        with tempfile.TemporaryFile() as file:
+            np.save(file, np.fft.fft(np.arange(8.0)))
+        np.linalg.svd(np.random.rand(30, 30))
+        pickle.loads(pickle.dumps(sums))
+        time.sleep(0.001)
+        print(round(sums[1]), datetime.datetime.now().year > 2000, time.tzname)
+    """
+    outcome = slots.play(acting(init=init, before=imports))
     assert (outcome.failure, outcome.stdout) == (None, b"50 True ('UTC', 'UTC')\n")
 
 
@@ -369,25 +324,17 @@ def test_float_settings_are_the_defaults_whatever_was_set_before(slots: Slots) -
 
 
 def test_a_policy_computes_on_one_thread_in_a_fixed_locale(slots: Slots) -> None:
-    policy = """
-        import ctypes, locale, os, time
-        class Policy:
-            def __init__(self, *spaces):
-                names = "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "PYTHONHASHSEED"
-                print([os.environ[name] for name in names], hash("a word"), locale.setlocale(locale.LC_ALL), time.tzname)
-                print(ctypes.CDLL(None).fegetround(), 5e-324 * float("1") > 0)
-            def reset(self, episode_index): pass
-            def act(self, obs): return [0.0]
-    """  # noqa: E501
+    init = """
+        names = "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "PYTHONHASHSEED"
+        print([os.environ[name] for name in names], hash("a word"), locale.setlocale(locale.LC_ALL), time.tzname)
+        print(ctypes.CDLL(None).fegetround(), 5e-324 * float("1") > 0)
+    """
+    policy = acting(init=init, before="import ctypes, locale, os, time")
     outputs = {slots.play(policy, slot=slots.slot()).stdout.decode() for _ in range(2)}
     other = slots.new()
     with pytest.MonkeyPatch.context() as patch:
-        for name, value in {
-            "OMP_NUM_THREADS": "7",
-            "PYTHONHASHSEED": "9",
-            "LC_ALL": "tr_TR",
-            "TZ": "Asia/Tokyo",
-        }.items():
+        other_values = {"OMP_NUM_THREADS": "7", "PYTHONHASHSEED": "9", "LC_ALL": "tr_TR", "TZ": "Asia/Tokyo"}
+        for name, value in other_values.items():
             patch.setenv(name, value)
         slots.run(other.start())
     outputs.add(slots.play(policy, slot=other).stdout.decode())
@@ -424,8 +371,8 @@ FAILS_AT_TWO = """
 
 def test_a_failed_episode_that_ends_has_one_random_action_after_the_failure(slots: Slots) -> None:
     ended, other = slots.play_all(FAILS_AT_TWO, n=2, policy_scope="submit", failed_episodes="end-submit")
-    assert ended.failure is not None
-    assert (ended.failure.category, ended.failure.step_index, ended.length) == ("act_error", 2, 3)
+    failure = failure_of(ended)
+    assert (failure.category, failure.step_index, ended.length) == ("act_error", 2, 3)
     assert [row.action for row in rows(ended)][:2] == [[0.5], [0.5]]
     assert [row.info.get("policy_failed", False) for row in rows(ended)] == [False, False, True]
     assert ended.episode_return == sum(row.reward for row in rows(ended))
@@ -436,6 +383,5 @@ def test_a_failed_episode_that_ends_has_one_random_action_after_the_failure(slot
 
 def test_an_episode_that_fails_in_reset_has_no_step(slots: Slots) -> None:
     (ended,) = slots.play_all(FAILS_AT_TWO, first=3, failed_episodes="end-submit")
-    assert ended.failure is not None
-    assert (ended.failure.category, ended.length, ended.episode_return) == ("reset_error", 0, 0.0)
+    assert (failure_of(ended).category, ended.length, ended.episode_return) == ("reset_error", 0, 0.0)
     assert rows(ended) == []

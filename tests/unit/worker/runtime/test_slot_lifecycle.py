@@ -10,7 +10,8 @@ from asyncio.base_subprocess import BaseSubprocessTransport
 from pathlib import Path
 
 import pytest
-from slots import HONEST, STUCK, Slots, begun, family, make_job, pid_of, runs
+from program_runs import put_program
+from slots import HONEST, STUCK, Slots, begun, failure_of, family, make_job, pid_of, runs
 from waiting import wait_until
 
 from evopolicy_common.errors import SandboxError, SlotDiedError, WorkerError
@@ -96,11 +97,9 @@ def test_a_closed_slot_leaves_no_process_and_no_file(slots: Slots) -> None:
 def test_a_start_that_is_cancelled_leaves_neither_half_of_bubblewrap(
     slots: Slots, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    pid_file, program = tmp_path / "pid", tmp_path / "bwrap"
-    program.write_text(
-        f"#!/bin/sh\nsleep 1000 & echo $! > {pid_file}.new; mv {pid_file}.new {pid_file}; wait\n"
-    )
-    program.chmod(0o755)
+    pid_file = tmp_path / "pid"
+    text = f"sleep 1000 & echo $! > {pid_file}.new; mv {pid_file}.new {pid_file}; wait"
+    put_program(tmp_path / "bwrap", text)
     monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
     connect = BaseSubprocessTransport._connect_pipes
 
@@ -179,6 +178,5 @@ def test_an_allowed_package_can_be_imported_with_what_it_needs(slots: Slots) -> 
     with slots.running(Slot(None, "bwrap", slots.folder / "with-yaml", ("numpy", "msgpack"))) as slot:
         policy = "import msgpack\n" + HONEST
         assert slots.play(policy, slot=slot).failure is None
-        failure = slots.play(policy).failure
-        assert failure is not None
+        failure = failure_of(slots.play(policy))
         assert failure.category == "import_error"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import msgspec
 import pytest
-from slots import HONEST, QUICK, Slots, category_of, misbehaving, rows
+from slots import HONEST, QUICK, Slots, category_of, failure_of, misbehaving, rows
 
 from evopolicy_common.messages.episode import EpisodeOutcome, ResourceLimits
 from evopolicy_worker import environments
@@ -73,8 +73,7 @@ def test_a_policy_that_fails_gets_its_verdict_and_is_replaced(
     slots: Slots, source: str, category: str, step: int | None, words: str
 ) -> None:
     outcome = slots.play(source)
-    failure = outcome.failure
-    assert failure is not None
+    failure = failure_of(outcome)
     assert (failure.category, failure.step_index) == (category, step)
     assert words in failure.message
     assert played_on_with_random_actions(outcome, step or 0)
@@ -99,8 +98,7 @@ def test_a_policy_that_fails_gets_its_verdict_and_is_replaced(
 def test_a_time_limit_is_reported_with_value_and_use(
     slots: Slots, source: str, changes: dict[str, float], category: str, limit: float
 ) -> None:
-    failure = slots.play(source, limits=limits(**changes)).failure
-    assert failure is not None
+    failure = failure_of(slots.play(source, limits=limits(**changes)))
     assert (failure.category, failure.limit) == (category, limit)
     assert failure.used is not None
     assert limit < failure.used < limit + 5
@@ -131,9 +129,9 @@ def test_a_bundle_without_a_policy_is_reported_at_index_0(
     slots: Slots, source: dict[str, str | bytes], category: str, words: str
 ) -> None:
     at_first = slots.play(source, first=0, limits=limits(init_wall_s=0.5))
-    assert at_first.failure is not None
-    assert at_first.failure.category == category
-    assert words in at_first.failure.message
+    failure = failure_of(at_first)
+    assert failure.category == category
+    assert words in failure.message
     assert (at_first.length, at_first.trajectory, at_first.episode_return) == (0, None, 0.0)
 
 
@@ -153,41 +151,32 @@ def test_a_submit_that_yields_no_policy_has_an_outcome_for_every_episode(slots: 
 
 def test_limits_of_files_and_actions_are_the_jobs_own(slots: Slots) -> None:
     few = limits(open_files=40, files=20, action_bytes=512)
-    sources = {
-        misbehaving(act="self.f = [open('/dev/null') for _ in range(60)]"): (
-            "file_limit",
-            "40 open descriptors",
-        ),
-        misbehaving(act="[open(f'f{k}', 'w') for k in range(60)]"): (
-            "file_limit",
-            "20 files and folders are the limit",
-        ),
-        misbehaving(act="return [0.0] * 99"): ("act_error", "more than 528 bytes"),
+    acts = {
+        "self.f = [open('/dev/null') for _ in range(60)]": ("file_limit", "40 open descriptors"),
+        "[open(f'f{k}', 'w') for k in range(60)]": ("file_limit", "20 files and folders are the limit"),
+        "return [0.0] * 99": ("act_error", "more than 528 bytes"),
     }
-    for source, (category, words) in sources.items():
+    for act, (category, words) in acts.items():
+        source = misbehaving(act=act)
         assert slots.play(source, limits=limits(files=1000)).failure is None
-        failure = slots.play(source, limits=few).failure
-        assert failure is not None
+        failure = failure_of(slots.play(source, limits=few))
         assert failure.category == category
         assert words in failure.message
 
 
 def test_a_policy_that_breaks_its_player_is_told_so(slots: Slots) -> None:
-    failure = slots.play(misbehaving(act="os.dup2(3, 4)")).failure
-    assert failure is not None
+    failure = failure_of(slots.play(misbehaving(act="os.dup2(3, 4)")))
     assert "answers for the policy was broken" in failure.message
 
 
 def test_a_full_file_system_is_reported_whatever_way_it_was_filled(slots: Slots) -> None:
     mapped = "import mmap; k = os.open('s', 66); os.truncate(k, 4 << 20); m = mmap.mmap(k, 4 << 20); "
     filled = "open('t', 'wb').write(bytes(3 << 20)); m[:] = bytes(4 << 20)"
-    failure = slots.play(misbehaving(act=mapped + filled)).failure
-    assert failure is not None
+    failure = failure_of(slots.play(misbehaving(act=mapped + filled)))
     assert (failure.category, "SIGBUS" in failure.message) == ("killed", True)
     assert "4,194,304 bytes, the limit" in failure.message
     lost = "os.environ.clear(); os.chdir('/'); [open(f'/tmp/{k}', 'w').close() for k in range(60)]"
-    failure = slots.play(misbehaving(act=lost), limits=limits(files=20)).failure
-    assert failure is not None
+    failure = failure_of(slots.play(misbehaving(act=lost), limits=limits(files=20)))
     assert (failure.category, failure.limit) == ("file_limit", 20)
 
 
@@ -198,26 +187,21 @@ def test_a_limit_beyond_the_machines_own_is_the_machines(slots: Slots) -> None:
 
 def test_a_forged_action_beyond_the_limit_ends_the_policy(slots: Slots) -> None:
     forged = "os.write(4, (20000).to_bytes(4, 'little') + bytes([5, 0, 0, 0]) + bytes(20000)); time.sleep(60)"
-    failure = slots.play(misbehaving(act=forged)).failure
-    assert failure is not None
+    failure = failure_of(slots.play(misbehaving(act=forged)))
     assert (failure.category, "20,000 bytes; 16,400 are the limit" in failure.message) == ("killed", True)
 
 
 def test_what_a_policy_may_return_grows_with_the_action_space() -> None:
     box = {"type": "Box", "shape": [3, 4], "dtype": "float32"}
-    spaces = {
-        "a": box,
-        "b": {"type": "Text", "min_length": 0, "max_length": 9},
-        "c": {"type": "Discrete", "n": 5},
-    }
+    text = {"type": "Text", "min_length": 0, "max_length": 9}
+    spaces = {"a": box, "b": text, "c": {"type": "Discrete", "n": 5}}
     rest = [{"type": "MultiDiscrete", "nvec": [4, 4]}, {"type": "MultiBinary", "n": [2, 3]}]
     whole = {"type": "Tuple", "spaces": [{"type": "Dict", "spaces": spaces}, *rest]}
     assert frames.elements(whole) == 12 + 9 + 1 + 2 + 6
 
 
 def test_a_traceback_shows_the_policys_lines_and_no_folder_of_the_worker(slots: Slots) -> None:
-    failure = slots.play(misbehaving(act="import json; json.loads('{')")).failure
-    assert failure is not None
+    failure = failure_of(slots.play(misbehaving(act="import json; json.loads('{')")))
     assert 'File "system/policy.py", line 16, in act' in failure.traceback
     assert "json/__init__.py" in failure.traceback
     assert "policy_server.py" not in failure.traceback
@@ -252,19 +236,17 @@ def test_output_of_c_code_is_kept(slots: Slots) -> None:
 
 @pytest.mark.parametrize("tier", ["landlock", "none"])
 def test_verdicts_are_the_same_in_the_other_tiers(slots: Slots, tier: str) -> None:
-    source = misbehaving(
-        act="[threading.Thread(target=time.sleep, args=(9,)).start() for _ in range(20)]; time.sleep(60)"
-    )
+    threads = "[threading.Thread(target=time.sleep, args=(9,)).start() for _ in range(20)]; time.sleep(60)"
     expected = {
-        misbehaving(act="time.sleep(60)"): "act_timeout",
-        misbehaving(act="os._exit(1)"): "killed",
-        misbehaving(act="bytearray(1 << 30)"): "oom",
-        misbehaving(act="open('big', 'wb').write(bytes(8 << 20))"): "file_limit",
-        misbehaving(act="os.kill(os.getpid(), 9)"): "act_error" if tier == "landlock" else "killed",
-        source: "process_limit",
+        "time.sleep(60)": "act_timeout",
+        "os._exit(1)": "killed",
+        "bytearray(1 << 30)": "oom",
+        "open('big', 'wb').write(bytes(8 << 20))": "file_limit",
+        "os.kill(os.getpid(), 9)": "act_error" if tier == "landlock" else "killed",
+        threads: "process_limit",
     }
-    for text, category in expected.items():
-        failure = slots.play(text, tier=tier, limits=limits(act_wall_s=1.0)).failure
-        assert failure is not None
+    for act, category in expected.items():
+        outcome = slots.play(misbehaving(act=act), tier=tier, limits=limits(act_wall_s=1.0))
+        failure = failure_of(outcome)
         assert failure.category == category, failure
         assert slots.play(HONEST, tier=tier).failure is None

@@ -66,7 +66,9 @@ def test_a_slots_whole_life(slots: Slots, monkeypatch: pytest.MonkeyPatch) -> No
     )
 
 
-def test_an_episodes_whole_life(tmp_path: Path, slots: Slots, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_episodes_whole_life(
+    tmp_path: Path, slots: Slots, monitor: Monitor, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Three episodes: an honest one, one whose policy fails, and one whose environment breaks down on an action."""
     lines: list[str] = []
     begin, source, step = loop._Episode._begin, loop._Episode._source, Line.step
@@ -98,14 +100,10 @@ def test_an_episodes_whole_life(tmp_path: Path, slots: Slots, monkeypatch: pytes
         reset="self.n, self.episode = 0, episode_index",
         act="if self.episode > 1: return [1.0] if self.episode == 3 else 1 / 0",
     )
-    commands, _never_written = os.pipe()
-    monitor = Monitor(commands, lambda: None, lambda: None)
-    monitor.start()
     player = loop.JobPlayer(zygote, plan, monitor, tmp_path)
     try:
-        told(
-            player.play_job(make_job(tier="none", n=3), bundle_files(slots.bundle(policy)), Progress(), told)
-        )
+        bundle = bundle_files(slots.bundle(policy))
+        told(player.play_job(make_job(tier="none", n=3), bundle, Progress(), told))
     finally:
         zygote.close()
     assert " ".join(lines) == (

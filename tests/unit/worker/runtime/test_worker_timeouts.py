@@ -13,7 +13,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from slots import HONEST, QUICK, Slots, make_job
+from program_runs import put_program
+from slots import HONEST, QUICK, Slots, acting, make_job
 
 from evopolicy_common.errors import SandboxError, SlotDiedError, WorkerError
 from evopolicy_worker import doctor, environments
@@ -28,13 +29,11 @@ from evopolicy_worker.slots import slot
 SOON_S = 0.2
 
 
-@contextlib.contextmanager
-def a_zygote(folder: Path) -> Iterator[Zygote]:
-    """One without a sandbox, as tier `none` has it."""
-    with contextlib.ExitStack() as stack:
-        found = Zygote(jail.plan("none", folder, ("numpy",)), folder)
-        stack.callback(found.close)
-        yield found
+@pytest.fixture
+def found(tmp_path: Path) -> Iterator[Zygote]:
+    """A zygote without a sandbox, as tier `none` has it."""
+    with contextlib.closing(Zygote(jail.plan("none", tmp_path, ("numpy",)), tmp_path)) as made:
+        yield made
 
 
 def test_a_zygote_that_does_not_start_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -44,70 +43,58 @@ def test_a_zygote_that_does_not_start_is_reported(tmp_path: Path, monkeypatch: p
         Zygote(mute, tmp_path)
 
 
-def test_a_zygote_that_stands_still_has_died(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_zygote_that_stands_still_has_died(found: Zygote, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(zygote, "ANSWER_TIMEOUT_S", SOON_S)
-    with a_zygote(tmp_path) as found:
-        os.kill(found._process.pid, signal.SIGSTOP)
-        with pytest.raises(SlotDiedError, match="timed out"):
-            found.spawn()
+    os.kill(found._process.pid, signal.SIGSTOP)
+    with pytest.raises(SlotDiedError, match="timed out"):
+        found.spawn()
 
 
-def test_a_zygote_whose_worker_is_gone_ends_by_itself(tmp_path: Path) -> None:
-    with a_zygote(tmp_path) as found:
-        found.bury_later(found.spawn())
-        found.bury()
-        found._control.close()
-        assert found._process.wait(60) == 0
+def test_a_zygote_whose_worker_is_gone_ends_by_itself(found: Zygote) -> None:
+    found.bury_later(found.spawn())
+    found.bury()
+    found._control.close()
+    assert found._process.wait(60) == 0
 
 
 def test_a_policys_process_that_survives_being_killed_is_reported(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    found: Zygote, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(zygote, "DEATH_TIMEOUT_S", SOON_S)
-    with a_zygote(tmp_path) as found:
-        child = found.spawn()
-        monkeypatch.setattr(Child, "kill", lambda self: None)
-        found.bury_later(child)
-        with pytest.raises(SandboxError, match="does not end"):
-            found.bury()
-        monkeypatch.undo()
-        child.kill()
+    child = found.spawn()
+    monkeypatch.setattr(Child, "kill", lambda self: None)
+    found.bury_later(child)
+    with pytest.raises(SandboxError, match="does not end"):
+        found.bury()
+    monkeypatch.undo()
+    child.kill()
 
 
-def test_a_child_that_does_not_seal_itself_is_killed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_child_that_does_not_seal_itself_is_killed(
+    found: Zygote, monitor: Monitor, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(policy_process, "_SEAL_S", SOON_S)
-    # Nor closed, since the monitor's thread lives on: of a pipe at its end it would read without pause.
-    commands, _never_written = os.pipe()
-    monitor = Monitor(commands, lambda: None, lambda: None)
-    monitor.start()
-    with a_zygote(tmp_path) as found:
-        child = found.spawn()
-        os.kill(child.host_pid, signal.SIGSTOP)
-        none = jail.plan("none", tmp_path, ("numpy",))
-        policy = PolicyProcess(found, child, monitor, none, QUICK, str(tmp_path))
-        description = environments.describe("toy/line")
-        meta = {"obs_space": description.obs_space, "action_space": description.action_space}
-        with pytest.raises(SandboxError, match="could not seal itself"):
-            policy.seal(messages.Files([], b""), bytes(16), meta, "arrays")
-        assert policy.dead
-        policy.end()
+    child = found.spawn()
+    os.kill(child.host_pid, signal.SIGSTOP)
+    none = jail.plan("none", tmp_path, ("numpy",))
+    policy = PolicyProcess(found, child, monitor, none, QUICK, str(tmp_path))
+    description = environments.describe("toy/line")
+    meta = {"obs_space": description.obs_space, "action_space": description.action_space}
+    with pytest.raises(SandboxError, match="could not seal itself"):
+        policy.seal(messages.Files([], b""), bytes(16), meta, "arrays")
+    assert policy.dead
+    policy.end()
 
 
 @pytest.mark.parametrize("options", [{}, {"policy_scope": "submit", "first": 0, "n": 2}])
 def test_a_policy_that_holds_its_output_is_not_awaited(slots: Slots, options: dict[str, Any]) -> None:
-    source = """
+    held = """
         import sys, time
-
         class Held:
             def write(self, text): pass
             def flush(self): time.sleep(1000)
-
-        class Policy:
-            def __init__(self, obs_space, action_space, env_meta): pass
-            def reset(self, episode_index): sys.stdout = Held()
-            def act(self, obs): return [0.0]
     """
-    outcomes = slots.play_all(source, **options)
+    outcomes = slots.play_all(acting(reset="sys.stdout = Held()", before=held), **options)
     assert outcomes[0].failure is None
     assert slots.play(HONEST).failure is None
 
@@ -128,9 +115,8 @@ def test_a_slot_that_does_not_heed_a_cancel_is_ended(slots: Slots, monkeypatch: 
     os.kill(own._process.pid, signal.SIGSTOP)
 
     async def cancelled() -> None:
-        playing = asyncio.create_task(
-            own.play_job(make_job(bundle=None, tier="none"), None, lambda episodes, steps: None)
-        )
+        job = make_job(bundle=None, tier="none")
+        playing = asyncio.create_task(own.play_job(job, None, lambda *progress: None))
         while own._idle.is_set():
             await asyncio.sleep(0)
         await own.cancel()
@@ -163,29 +149,21 @@ def test_a_video_that_takes_too_long_is_done_without(
     if bound == "MAX_S":
         monkeypatch.setattr(video, "MAX_S", 0.0)
     recorder = video.VideoRecorder(**allowed)
-    run = subprocess.Popen
-    monkeypatch.setattr(
-        subprocess, "Popen", lambda words, **more: run([sys.executable, "-c", "input()"], **more)
-    )
+    run, waits = subprocess.Popen, [sys.executable, "-c", "input()"]
+    monkeypatch.setattr(subprocess, "Popen", lambda words, **more: run(waits, **more))
     description = environments.describe("toy/maze")
     assert description.renders
     case = make_job().episodes[0].case
-    assert recorder.record(description, case, b"", frames, never) is None
+    assert recorder.record(description, case, b"", frames, lambda: False) is None
     assert "it took too long" in capfd.readouterr().err
     recorder.close()
-
-
-def never() -> bool:
-    return False
 
 
 def test_a_bubblewrap_that_does_not_answer_is_missing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(doctor, "_TIMEOUT_S", SOON_S)
-    program = tmp_path / "bwrap"
-    program.write_text("#!/bin/sh\nexec sleep 1000\n")
-    program.chmod(0o755)
+    put_program(tmp_path / "bwrap", "exec sleep 1000")
     monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
     version, why = doctor._bubblewrap()
     assert (version, "timed out" in why) == ("", True)

@@ -12,7 +12,7 @@ import sys
 import msgspec
 import pytest
 from machines.cgroups import limited, starved
-from slots import HONEST, QUICK, Slots, acting, begun, category_of, family, misbehaving, pid_of
+from slots import HONEST, QUICK, Slots, acting, begun, category_of, failure_of, family, misbehaving, pid_of
 from stateful_policy import PATIENT, essence, place_of_env, stateful, struck
 
 from evopolicy_common.errors import SlotDiedError
@@ -83,8 +83,7 @@ def test_a_slot_whose_environment_is_stopped_for_good_is_given_up(
 
 def test_where_a_policy_may_stop_itself_the_time_counts(slots: Slots) -> None:
     source = misbehaving(act="os.kill(os.getpid(), signal.SIGSTOP)")
-    failure = slots.play(source, tier="none", limits=TIGHT).failure
-    assert failure is not None
+    failure = failure_of(slots.play(source, tier="none", limits=TIGHT))
     assert failure.category == "act_timeout"
 
 
@@ -134,8 +133,7 @@ def test_no_wall_limit_counts_time_without_a_processor(slots: Slots) -> None:
 def test_a_policy_that_waits_for_its_own_threads_is_not_excused(slots: Slots) -> None:
     threads = "[threading.Thread(target=lambda: [None for _ in iter(int, 1)], daemon=True).start() for _ in range(6)]"
     source = COMPUTES.replace("PAUSE", "0.3").replace("OTHERS", threads).replace("MINE", "30")
-    failure = slots.play(source, limits=TIGHT).failure
-    assert failure is not None
+    failure = failure_of(slots.play(source, limits=TIGHT))
     assert failure.category in ("act_timeout", "cpu_limit")
     assert failure.used is not None
     assert failure.used < 10
