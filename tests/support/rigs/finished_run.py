@@ -37,61 +37,30 @@ def played_episode(**more: Any) -> EpisodeFeedback:
     return EpisodeFeedback(**{**usual, "stdout": b"", "stderr": b"", **more})
 
 
+def played_submit(**fields: Any) -> SubmitResult:
+    usual: dict[str, Any] = {"submit_index": 0, "status": "ok", "bundle": None, "env_instances": (0,)}
+    usual |= {"remaining_budget": 0, "mean_return": 1.0, "val_mean": 1.0}
+    return SubmitResult(**usual | {"started_at": 101.0, "completed_at": 102.0} | fields)
+
+
 def finished(**fields: Any) -> RunFinished:
-    usual: dict[str, Any] = {
-        "run": "r-1",
-        "settings": SETTINGS,
-        "status": "completed",
-        "error": None,
-        "closed_reason": "budget_spent",
-        "agent": {"turns": 2, "retries": 1, "settings": {"effort": "high"}, "tokens": None},
-        "final_score": 2.0,
-        "best_submit_index": 1,
-        "heldout_returns": (1.0, 3.0),
-        "validation_ineligible": (2,),
-        "policy_failures": {"validation": 0, "heldout": 1},
-        "random_heldout_returns": (0.0, 1.0),
-        "budget": 8,
-        "min_episodes_per_submit": 1,
-        "max_episodes_per_submit": 8,
-        "n_train": 64,
-        "n_validation": 2,
-        "n_heldout": 2,
-        "budget_used": 8,
-        "split_hashes": {"train": "a", "validation": "b", "heldout": "c"},
-        "cases_secret": True,
-        "env_version": "line-1",
-        "deterministic": True,
-        "fingerprint": Fingerprint(code_version="1", python="3.11", packages={"numpy": "2.4"}, cpu="x"),
-        "created_at": 100.0,
-        "finished_at": 112.5,
-        "submits": tuple(
-            SubmitResult(
-                submit_index=index,
-                status="ok",
-                bundle=None,
-                env_instances=(0,),
-                remaining_budget=0,
-                mean_return=1.0,
-                val_mean=val_mean,
-                started_at=101.0,
-                completed_at=102.0,
-            )
-            for index, val_mean in enumerate((1.0, 1.5))
-        ),
-        "wall_s": {"queue": 0.5, "rollout": 3.0, "finalise": 2.5},
-        "n_overrides": 1,
-        "fingerprint_overrides": ("a → b: the old workers are gone",),
-        "heldout_successes": (),
-        "infrastructure_retries": 0,
-        "nondeterministic_results": 0,
-        "env_title": "",
-        "env_family": "",
-        "installations": (),
-        "hidden_isolation": "unknown",
-        "record": {},
-        "committed": Committed(commitment="c", epoch="e1", opened=0, opened_head="h"),
-    }
+    usual: dict[str, Any] = {"run": "r-1", "settings": SETTINGS, "status": "completed", "error": None}
+    usual["agent"] = {"turns": 2, "retries": 1, "settings": {"effort": "high"}, "tokens": None}
+    usual |= {"closed_reason": "budget_spent", "final_score": 2.0, "best_submit_index": 1}
+    usual |= {"heldout_returns": (1.0, 3.0), "heldout_successes": (), "random_heldout_returns": (0.0, 1.0)}
+    usual |= {"validation_ineligible": (2,), "policy_failures": {"validation": 0, "heldout": 1}}
+    usual |= {"budget": 8, "min_episodes_per_submit": 1, "max_episodes_per_submit": 8, "budget_used": 8}
+    usual |= {"n_train": 64, "n_validation": 2, "n_heldout": 2, "cases_secret": True}
+    usual["split_hashes"] = {"train": "a", "validation": "b", "heldout": "c"}
+    usual |= {"env_version": "line-1", "deterministic": True, "env_title": "", "env_family": ""}
+    usual["fingerprint"] = Fingerprint(code_version="1", python="3.11", packages={"numpy": "2.4"}, cpu="x")
+    usual |= {"n_overrides": 1, "fingerprint_overrides": ("a → b: the old workers are gone",)}
+    usual |= {"created_at": 100.0, "finished_at": 112.5}
+    usual["wall_s"] = {"queue": 0.5, "rollout": 3.0, "finalise": 2.5}
+    usual["submits"] = (played_submit(), played_submit(submit_index=1, val_mean=1.5))
+    usual |= {"infrastructure_retries": 0, "nondeterministic_results": 0, "installations": ()}
+    usual |= {"hidden_isolation": "unknown", "record": {}}
+    usual["committed"] = Committed(commitment="c", epoch="e1", opened=0, opened_head="h")
     return RunFinished(**usual | fields)
 
 

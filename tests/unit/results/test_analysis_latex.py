@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import re
 import shutil
-import subprocess
 import unicodedata
 from pathlib import Path
 
@@ -15,6 +14,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from invented.small_table import TABLE
+from program_runs import run_program
 
 from evopolicy_results.tables.latex import latex_text, to_latex
 from evopolicy_results.tables.table import Column, Table
@@ -105,14 +105,7 @@ def test_what_is_written_compiles_and_fits_the_page(tmp_path: Path) -> None:
     page = "\\documentclass{article}\\textwidth=397pt\\usepackage{adjustbox,array,booktabs}"
     (tmp_path / "all.tex").write_text(page + "\\begin{document}" + "\n".join(names) + "\\end{document}\n")
     for _ in range(2):
-        done = subprocess.run(
-            ["pdflatex", "-interaction=nonstopmode", "all.tex"],
-            cwd=tmp_path,
-            capture_output=True,
-            text=True,
-            timeout=60,
-            check=False,
-        )
+        done = run_program("pdflatex", "-interaction=nonstopmode", "all.tex", cwd=tmp_path)
         assert done.returncode == 0, done.stdout[-3000:]
     assert "Float too large" not in done.stdout
     assert "Overfull" not in done.stdout

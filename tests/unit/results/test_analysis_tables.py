@@ -17,8 +17,9 @@ from evopolicy_results.behaviour.trace import trace
 from evopolicy_results.figures.plot import inline_svg
 from evopolicy_results.figures.policies import wilson
 from evopolicy_results.figures.style import new_figure, svg_text
-from evopolicy_results.reading.agent_log import read_agent_log
+from evopolicy_results.reading.agent_log import LogReading, read_agent_log
 from evopolicy_results.reading.reader import read_run
+from evopolicy_results.reading.records import Run
 from evopolicy_results.studies.study import study
 from evopolicy_results.tables.report_tables import tables_of
 from evopolicy_results.tables.table import Column, Table, best_marks, to_csv, to_markdown
@@ -145,26 +146,27 @@ def test_log_without_answers_or_times_is_not_guessed_into_place(tmp_path: Path) 
     assert reading.unplaced == ("I start simple.", "It is too slow.", "submit 2", "Back to work.")
 
 
+def read_lines(run: Run, *lines: bytes | dict[str, object]) -> LogReading:
+    """The reading of an agent's log with these lines."""
+    log = run.path / "agent.jsonl"
+    log.write_bytes(b"\n".join(one if isinstance(one, bytes) else json.dumps(one).encode() for one in lines))
+    return read_agent_log(log, run.submits)
+
+
 def test_plain_lines_that_begin_with_a_submits_name_tell_its_place(tmp_path: Path) -> None:
     run = read_run(write_run(tmp_path, VERSIONS[:2], log=None))
-    log = tmp_path / "agent.jsonl"
     lines = ["gain 1.0", "submit_000: ok, mean 3.5", "gain 2.0 looks better", "submit_001: ok", "bye"]
-    log.write_text("".join(json.dumps({"type": "stdout", "text": line}) + "\n" for line in lines))
-    reading = read_agent_log(log, run.submits)
+    reading = read_lines(run, *({"type": "stdout", "text": line} for line in lines))
     assert [one.attribution for one in reading.by_submit.values()] == ["gain 1.0", "gain 2.0 looks better"]
     assert reading.unplaced == ("submit_001: ok", "bye")
 
 
 def test_stamped_lines_are_placed_by_time(tmp_path: Path) -> None:
     run = read_run(write_run(tmp_path, VERSIONS[:2], log=None))
-    log = tmp_path / "agent.jsonl"
-    lines = [
-        {"turn": 0, "text": "early", "timestamp": "2020-01-01T00:00:00Z"},
-        {"turn": 1, "text": "between", "timestamp": run.submits[1].started_at},
-        {"turn": 2, "text": "late", "timestamp": "2040-01-01T00:00:00Z"},
-    ]
-    log.write_text("".join(json.dumps(line) + "\n" for line in lines))
-    reading = read_agent_log(log, run.submits)
+    said = ("2020-01-01T00:00:00Z", run.submits[1].started_at, "2040-01-01T00:00:00Z")
+    texts = zip(("early", "between", "late"), said, strict=True)
+    lines = ({"turn": turn, "text": text, "timestamp": at} for turn, (text, at) in enumerate(texts))
+    reading = read_lines(run, *lines)
     placed = {index: one.messages for index, one in reading.by_submit.items()}
     assert placed == {0: ("early",), 1: ("between",)}
     assert reading.unplaced == ("late",)
@@ -172,20 +174,12 @@ def test_stamped_lines_are_placed_by_time(tmp_path: Path) -> None:
 
 def test_damaged_or_strange_log_lines_are_passed_over(tmp_path: Path) -> None:
     run = read_run(write_run(tmp_path, VERSIONS[:1], log=None))
-    log = tmp_path / "agent.jsonl"
-    strange = [
-        b"\xff\xfe",
-        b"[1, 2]",
-        b'{"type": 7}',
-        b'{"type": "assistant", "message": [1]}',
-        b"[" * 100_000,
-        b'"text"',
-        b'{"type": "assistant", "message": {"content": "\xd6 "}}',
-    ]
+    strange = [b"\xff\xfe", b"[1, 2]", b'{"type": 7}', b'"text"', b"[" * 100_000]
+    strange.append(b'{"type": "assistant", "message": [1]}')
+    strange.append(b'{"type": "assistant", "message": {"content": "\xd6 "}}')
     strange.append(b'{"turn": 1, "text": "hello"}')
     strange.append(b'{"type": "item.completed", "item": {"type": "command_execution", "command": null}}')
-    log.write_bytes(b"\n".join(strange))
-    assert read_agent_log(log, run.submits).unplaced == ("hello",)
+    assert read_lines(run, *strange).unplaced == ("hello",)
     assert read_agent_log(tmp_path / "absent", run.submits).unplaced == ()
 
 

@@ -17,7 +17,7 @@ def episode(*rewards: float, ends: int | None = None) -> Trajectory:
     return decode(recorder.finish())
 
 
-def up(value: float, places: int) -> float:
+def up(places: int, value: float = 0.3) -> float:
     for _ in range(places):
         value = math.nextafter(value, math.inf)
     return value
@@ -30,14 +30,14 @@ AFTER = 0.10000000894069672
 @pytest.mark.parametrize(
     ("recorded", "again", "is_rounding"),
     [
-        (episode(1.0, 0.3), episode(1.0, up(0.3, LAST_PLACES)), True),
-        (episode(1.0, 0.3), episode(1.0, up(0.3, LAST_PLACES + 1)), False),
+        (episode(1.0, 0.3), episode(1.0, up(LAST_PLACES)), True),
+        (episode(1.0, 0.3), episode(1.0, up(LAST_PLACES + 1)), False),
         (episode(SINGLE), episode(AFTER), True),
         (episode(0.1), episode(AFTER), False),
-        (episode(up(0.3, 1), 5.0), episode(0.3, 7.0), True),
+        (episode(up(1), 5.0), episode(0.3, 7.0), True),
         (episode(0.0), episode(-0.0), True),
-        (episode(5.0, up(0.3, 1)), episode(7.0, 0.3), False),
-        (episode(up(0.3, 1), ends=0), episode(0.3, ends=1), False),
+        (episode(5.0, up(1)), episode(7.0, 0.3), False),
+        (episode(up(1), ends=0), episode(0.3, ends=1), False),
         (episode(1.0, 1.0), episode(1.0), False),
         (episode(1.0), episode(math.nan), False),
         (episode(1e300), episode(math.inf), False),

@@ -56,17 +56,8 @@ VERSIONS = [
     Version(policy(gain=2.0), (-90.0,), -95.0, failed=(0,)),
 ]
 ROW = {"t": 0, "obs": [0.1], "action": 1, "reward": -1.0, "terminated": False, "truncated": False, "info": {}}
-TEXTS = [
-    "",
-    "\0",
-    "\x1b[2J\x07",
-    "<script>",
-    "=cmd|'/C calc'!A0",
-    "../../x",
-    "/etc/passwd",
-    "a" * 5000,
-    "a\nb",
-]
+TEXTS = ["", "\0", "\x1b[2J\x07", "<script>", "=cmd|'/C calc'!A0"]
+TEXTS += ["../../x", "/etc/passwd", "a" * 5000, "a\nb"]
 NUMBERS = [*words('NaN -Infinity 1e400 1e308 -1 null true "x" [] {}'), "9" * 400, "9" * 5000]
 NUMBERS += ['"\\ud800"', "[" * 3000 + "]" * 3000, "-9223372036854775809", "1e-400"]
 
@@ -113,19 +104,6 @@ def _verify(run: Path, whole: Path) -> None:
                 continue
 
 
-def _rescore(run: Path, whole: Path) -> None:
-    read_finished([run])
-
-
-def _publish(run: Path, whole: Path) -> None:
-    find_runs([run])
-
-
-def _diff(run: Path, whole: Path) -> None:
-    differences(whole, run)
-    differences(run, whole)
-
-
 def _export(run: Path, whole: Path) -> None:
     out = run.parents[3] / "out"
     out.mkdir(exist_ok=True)
@@ -134,10 +112,6 @@ def _export(run: Path, whole: Path) -> None:
     transcripts.write_atif(runs, out)
     transcripts.write_inspect(runs, out)
     assert runs._repr_html_()
-
-
-def _track(run: Path, whole: Path) -> None:
-    list(tracking.track([run], _Nowhere(), follow=False))
 
 
 def _web(run: Path, whole: Path) -> None:
@@ -163,14 +137,14 @@ def _harbor(run: Path, whole: Path) -> None:
         scores._score(RunFolder(run))
 
 
-READERS: dict[str, Callable[[Path, Path], None]] = {
+READERS: dict[str, Callable[[Path, Path], object]] = {
     "report": _report,
     "verify": _verify,
-    "rescore": _rescore,
-    "publish": _publish,
-    "diff": _diff,
+    "rescore": lambda run, _: read_finished([run]),
+    "publish": lambda run, _: find_runs([run]),
+    "diff": lambda run, whole: [differences(whole, run), differences(run, whole)],
     "export": _export,
-    "track": _track,
+    "track": lambda run, _: list(tracking.track([run], _Nowhere(), follow=False)),
     "web": _web,
     "harbor": _harbor,
 }

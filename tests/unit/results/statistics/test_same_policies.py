@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 from invented.policies import Version, policy
 from invented.run_dirs import write_run
-from rigs.finished_run import finished
+from rigs.finished_run import finished, played_submit
 
-from evopolicy_common.messages.operator import SubmitResult
 from evopolicy_common.records.policies import checkpoints
 from evopolicy_common.records.run_record import decode_run_record
 from evopolicy_results.leaderboard.bundles import LabBundle
@@ -64,12 +63,8 @@ def test_equal_repeats_have_no_interval_over_runs_anywhere() -> None:
     one, two, other = cell("A", "a"), cell("A", "a", "a"), cell("B", "b", "c", level=-3.0)
     assert cell_mean(two) == cell_mean(one)
     (pair,) = pairs({("A", "env"): two, ("B", "env"): other}, ["A", "B"], ["env"])
-    assert (pair.compares, pair.gap.over, pair.n_runs, pair.p_exchange) == (
-        "checkpoints",
-        "cases",
-        (1, 2),
-        None,
-    )
+    assert (pair.compares, pair.gap.over) == ("checkpoints", "cases")
+    assert (pair.n_runs, pair.p_exchange) == ((1, 2), None)
     samples = {("A", "env"): two, ("B", "env"): cell("B", "b", "b")}
     scales = {"env": Scale(random=-4.0, best=0.0)}
     found, (improvement,) = aggregates(samples, ["A", "B"], scales)
@@ -88,9 +83,8 @@ def test_a_repeated_policy_counts_in_the_mean_and_once_in_the_variance() -> None
     expected = 2.0 * (0.75**2 * (a - several.mean) ** 2 + 0.25**2 * (b - several.mean) ** 2)
     assert kept.mean(axis=1).var(ddof=1) / 2 == pytest.approx(expected)
     # Of the same number of runs, all different, nothing changes.
-    assert returns_in(cell("A", "a", "b", "c")).tolist() == [
-        list(run.returns) for run in cell("A", "a", "b", "c").runs
-    ]
+    different = cell("A", "a", "b", "c")
+    assert returns_in(different).tolist() == [list(run.returns) for run in different.runs]
 
 
 def played(root: Path, gains: tuple[float, ...], entry: str = "Climber") -> list[Path]:
@@ -117,13 +111,10 @@ def test_a_report_names_equal_repeats_and_has_no_interval_over_runs(tmp_path: Pa
     (pair,) = (row for row in by_name["pairs"].rows if row["second"] == "Walker")
     assert (pair["compares"], pair["over"], pair["runs"]) == ("checkpoints", "cases", "1 and 2")
     table = found.suites[0].table
-    assert {entry: table.cells[entry, "gym/acrobot"].repeated for entry in table.agents} == {
-        "Climber": BOTH,
-        "Walker": "",
-    }
-    assert {
-        row["n_runs"][0] for row in rows(found.suites[0].statistics.pairs) if row["first"] == "Climber"
-    } == {1}
+    named = {entry: table.cells[entry, "gym/acrobot"].repeated for entry in table.agents}
+    assert named == {"Climber": BOTH, "Walker": ""}
+    compared = rows(found.suites[0].statistics.pairs)
+    assert {row["n_runs"][0] for row in compared if row["first"] == "Climber"} == {1}
 
 
 def test_a_leaderboard_names_equal_repeats(tmp_path: Path) -> None:
@@ -146,21 +137,9 @@ def test_a_card_names_equal_repeats(tmp_path: Path, gains: tuple[float, ...], ov
     for number, folder in enumerate(played(tmp_path, gains)):
         record = decode_run_record((folder / "run.json").read_bytes())
         bundle = checkpoints.bundle_of(next(folder.glob("checkpoints/*"))).digest
-        submit = SubmitResult(
-            submit_index=0,
-            status="ok",
-            bundle=bundle,
-            env_instances=(0,),
-            remaining_budget=0,
-            mean_return=-200.0,
-            val_mean=-180.0,
-            started_at=1.0,
-            completed_at=2.0,
-        )
-        returns = record.outcome.heldout_returns
-        result = finished(
-            run=f"r-{number}", best_submit_index=0, heldout_returns=returns, submits=(submit,)
-        ).result
+        submit = played_submit(bundle=bundle, mean_return=-200.0, val_mean=-180.0)
+        played_run = {"run": f"r-{number}", "heldout_returns": record.outcome.heldout_returns}
+        result = finished(**played_run, best_submit_index=0, submits=(submit,)).result
         sources.append(cards.Source(f"runs/{number:04d}", record, result))
     card = cards.make(sources, [], signer="", software="")
     assert card.results[0].over == over

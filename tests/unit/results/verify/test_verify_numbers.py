@@ -21,9 +21,9 @@ import pytest
 from edits import edited, put
 from invented.policies import Version, policy
 from invented.run_dirs import amend, write_run
-from rigs.finished_run import finished
+from rigs.finished_run import finished, played_submit
 
-from evopolicy_common.messages.operator import RunResult, SubmitResult
+from evopolicy_common.messages.operator import RunResult
 from evopolicy_common.records.code_metrics import TREND
 from evopolicy_common.records.policies.checkpoints import bundle_of
 from evopolicy_common.records.rescores import Rescored, RescoreRecord, encode_rescore, rescore_path
@@ -75,31 +75,15 @@ def result(whole: Path) -> RunResult:
     submits = []
     for submit in run.submits:
         assert submit.summary.env_instances is not None
-        submits.append(
-            SubmitResult(
-                submit_index=submit.index,
-                status=submit.summary.status,
-                bundle=bundle_of(submit.checkpoint).digest,
-                env_instances=submit.summary.env_instances,
-                remaining_budget=submit.summary.remaining_budget,
-                mean_return=submit.summary.mean_return,
-                val_mean=(outcome.val_scores or {}).get(str(submit.index)),
-                started_at=1.0,
-                completed_at=2.0,
-            )
-        )
-    return finished(
-        status=outcome.status,
-        closed_reason=outcome.closed_reason,
-        best_submit_index=outcome.best_submit_index,
-        final_score=outcome.final_score,
-        heldout_returns=outcome.heldout_returns,
-        random_heldout_returns=(-500.0,) * 32,
-        validation_ineligible=(),
-        policy_failures={},
-        budget_used=outcome.budget_used,
-        submits=tuple(submits),
-    ).result
+        told = ("status", "env_instances", "remaining_budget", "mean_return")
+        summary = {name: getattr(submit.summary, name) for name in told}
+        val_mean = (outcome.val_scores or {}).get(str(submit.index))
+        bundle = bundle_of(submit.checkpoint).digest
+        submits.append(played_submit(submit_index=submit.index, bundle=bundle, val_mean=val_mean, **summary))
+    same = ("status", "closed_reason", "best_submit_index", "final_score", "heldout_returns", "budget_used")
+    fields: dict[str, Any] = {name: getattr(outcome, name) for name in same}
+    fields |= {"random_heldout_returns": (-500.0,) * 32, "validation_ineligible": (), "policy_failures": {}}
+    return finished(**fields, submits=tuple(submits)).result
 
 
 Edit = Callable[[Copy], object]
@@ -111,12 +95,8 @@ def _score(run: Copy, returns: list[float]) -> None:
     def change(record: Any) -> None:
         mean = math.fsum(returns) / len(returns)
         std = math.sqrt(math.fsum((each - mean) ** 2 for each in returns) / len(returns))
-        record["outcome"] |= {
-            "heldout_returns": returns,
-            "final_score": mean,
-            "heldout_mean_return": mean,
-            "heldout_std_return": std,
-        }
+        record["outcome"] |= {"heldout_returns": returns, "final_score": mean}
+        record["outcome"] |= {"heldout_mean_return": mean, "heldout_std_return": std}
 
     run.edit("run.json", change)
 
