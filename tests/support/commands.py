@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from coordinator_harness import Coordinator
+from program_runs import run_program
 from waiting import TIMEOUT_S, wait_until
 
 from evopolicy_common.processes import proc
@@ -64,15 +65,8 @@ def evopolicy(
 ) -> subprocess.CompletedProcess[str]:
     """`evopolicy`, or another program of ours, with these arguments in `cwd`, to its end. `code`: the exit code that it
     has to have."""
-    done = subprocess.run(
-        [sys.executable, "-m", program, *args],
-        cwd=cwd,
-        env={**os.environ, **environment},
-        capture_output=True,
-        text=True,
-        timeout=1200,
-        check=False,
-    )
+    more = {"cwd": cwd, "env": {**os.environ, **environment}, "timeout": 1200}
+    done = run_program(sys.executable, "-m", program, *args, **more)
     assert code in (None, done.returncode), done.stdout + done.stderr
     return done
 

@@ -116,15 +116,9 @@ def play(job: Job, spec: EpisodeSpec) -> EpisodeOutcome:
     """An outcome that depends on nothing but the bundle and the case."""
     text = f"{job.bundle}|{spec.case.seed}".encode()
     value = int.from_bytes(hashlib.sha256(text).digest()[:4], "big") / 2**32
-    return EpisodeOutcome(
-        index=spec.index,
-        episode_return=value,
-        length=10,
-        terminated=True,
-        truncated=False,
-        trajectory=_blob(b"trajectory of " + text),
-        stdout=b"hello",
-    )
+    values = {"length": 10, "terminated": True, "truncated": False, "stdout": b"hello"}
+    trajectory = _blob(b"trajectory of " + text)
+    return EpisodeOutcome(index=spec.index, episode_return=value, trajectory=trajectory, **values)
 
 
 class InstantWorker:
@@ -225,11 +219,8 @@ class GatewayClient:
         self.ask = Requester(link, lambda verb: keys.gateway_key(cluster, run, verb), codec.gateway_replies)
 
     async def open(self) -> gateway.RunOpened:
-        return await self.ask.until_answered(
-            "open",
-            gateway.OpenRun(run=self.run, token=self.token, asks_permit=True),
-            gateway.RunOpened,
-        )
+        message = gateway.OpenRun(run=self.run, token=self.token, asks_permit=True)
+        return await self.ask.until_answered("open", message, gateway.RunOpened)
 
     async def permit(self, boot_id: str, wait_s: float = 0.0) -> gateway.Permit:
         """The right that the agent may be alive on a kernel; `gateway_of` has one for a machine without workers."""
@@ -287,15 +278,8 @@ class OperatorClient:
         self.ask = Requester(link, lambda verb: keys.operator_key(cluster, verb), codec.operator_replies)
 
     async def create(self, key: str = "run", **settings: Any) -> operator.RunCreated:
-        values = {
-            "env": "toy/line",
-            "entry": "tester",
-            "model": "none",
-            "exp_id": "t",
-            "budget": 16,
-            **settings,
-        }
-        message = operator.CreateRun(token=self.token, key=key, settings=RunSettings(**values))
+        usual = {"env": "toy/line", "entry": "tester", "model": "none", "exp_id": "t", "budget": 16}
+        message = operator.CreateRun(token=self.token, key=key, settings=RunSettings(**{**usual, **settings}))
         return await self.ask.until_answered("create", message, operator.RunCreated)
 
     async def progress(self, run: str, wait_s: float = 2.0) -> operator.RunProgress:

@@ -18,7 +18,7 @@ import numpy as np
 from rigs.finished_run import mark_opened
 from rigs.service_world import IDENTITY, Requested, World
 
-from evopolicy_common.messages import operator, worker
+from evopolicy_common.messages import gateway, operator, worker
 from evopolicy_common.messages.environment import EnvironmentDescription
 from evopolicy_common.messages.episode import (
     BlobRef,
@@ -27,19 +27,7 @@ from evopolicy_common.messages.episode import (
     PolicyFailure,
     ResourceLimits,
 )
-from evopolicy_common.messages.gateway import (
-    CloseRun,
-    OpenRun,
-    RequestPermit,
-    ResultsPage,
-    ResultsRequest,
-    RunClosed,
-    RunOpened,
-    RunState,
-    StateReply,
-    Submit,
-    SubmitAccepted,
-)
+from evopolicy_common.messages.gateway import CloseRun, RunOpened, RunState, Submit
 from evopolicy_common.messages.run_settings import PUBLISHED, RunSettings
 from evopolicy_common.messages.worker import BlobPut, Message, Refused
 from evopolicy_common.records.blobs import digest_of
@@ -63,17 +51,12 @@ SUBMIT_WALL_S = 1800.0
 N_HIDDEN = (16, 32)
 """Validation and held-out cases in the files, of which only runs of the published profile use all."""
 
+BOX = {"type": "Box", "dtype": "float32"}
 LINE = EnvironmentDescription(
     env="toy/line",
     env_version="toy/line (evopolicy, version 1)",
-    obs_space={
-        "type": "Box",
-        "shape": [3],
-        "dtype": "float32",
-        "low": [-2.0, -1.0, -1.5],
-        "high": [2.0, 1.0, 1.5],
-    },
-    action_space={"type": "Box", "shape": [1], "dtype": "float32", "low": [-1.0], "high": [1.0]},
+    obs_space=BOX | {"shape": [3], "low": [-2.0, -1.0, -1.5], "high": [2.0, 1.0, 1.5]},
+    action_space=BOX | {"shape": [1], "low": [-1.0], "high": [1.0]},
     max_episode_steps=60,
     reward_components=("reward_distance",),
     task_text="# A line\n\nPush the mass to the target.",
@@ -208,15 +191,15 @@ class Double:
     def heard(self, message: Message, payload: bytes) -> bytes:
         """Notes the service's answer, and returns what the gateway gets."""
         answer = codec.decode(codec.gateway_replies, payload)
-        if isinstance(message, Submit) and isinstance(answer, SubmitAccepted):
+        if isinstance(message, Submit) and isinstance(answer, gateway.SubmitAccepted):
             if message.key not in {old.key for old in self.submits}:
                 self.submits.append(message)
-        elif isinstance(message, CloseRun) and isinstance(answer, RunClosed):
+        elif isinstance(message, CloseRun) and isinstance(answer, gateway.RunClosed):
             self.closed = message
         if self.held_s is not None:
-            if isinstance(answer, ResultsPage):
+            if isinstance(answer, gateway.ResultsPage):
                 return codec.encode(msgspec.structs.replace(answer, held_s=self.held_s))
-            if isinstance(answer, RunOpened | StateReply):
+            if isinstance(answer, RunOpened | gateway.StateReply):
                 state = msgspec.structs.replace(answer.state, held_s=self.held_s)
                 return codec.encode(msgspec.structs.replace(answer, state=state))
         return payload
@@ -306,16 +289,12 @@ class Double:
         async def ask(verb: str, message: Message) -> Any:
             return await self._ask(keys.gateway_key(CLUSTER, created.run, verb), message)
 
-        await ask("open", OpenRun(**speaker, asks_permit=True))
-        await ask("permit", RequestPermit(**speaker, boot_id="kernel-of-another-agent"))
+        await ask("open", gateway.OpenRun(**speaker, asks_permit=True))
+        await ask("permit", gateway.RequestPermit(**speaker, boot_id="kernel-of-another-agent"))
         bundle = bundles.pack([BundleFile("policy.py", False, b"class Policy: pass")])
-        size = len(bundle.packed)
-        put = BlobPut(
-            sender=created.run, token=token, digest=bundle.digest, size=size, offset=0, data=bundle.packed
-        )
-        await ask("blob", put)
+        await ask("blob", _whole(bundle.packed, sender=created.run, token=token))
         await ask("submit", Submit(**speaker, key="k", env_instances=(0,), bundle=bundle.digest))
-        asked = ResultsRequest(**speaker, submit_index=0, cursor=1, wait_s=1.0)
+        asked = gateway.ResultsRequest(**speaker, submit_index=0, cursor=1, wait_s=1.0)
         while (await ask("results", asked)).done is None:
             pass
         self.scoring.set()
@@ -325,14 +304,14 @@ class Double:
 
     async def cancel(self) -> None:
         """The operator cancels the run."""
-        message = operator.CancelRun(token="operate", run=self.run_id)
-        answer = await self._ask(keys.operator_key(CLUSTER, "cancel"), message)
-        assert not isinstance(answer, Refused), answer
+        await self._order("cancel", operator.CancelRun(token="operate", run=self.run_id))
 
     async def agent_gone(self) -> None:
         """The operator says that the run's agent is not alive, from wherever it was."""
-        message = operator.AgentGone(token="operate", run=self.run_id)
-        answer = await self._ask(keys.operator_key(CLUSTER, "agent_gone"), message)
+        await self._order("agent_gone", operator.AgentGone(token="operate", run=self.run_id))
+
+    async def _order(self, verb: str, message: Message) -> None:
+        answer = await self._ask(keys.operator_key(CLUSTER, verb), message)
         assert not isinstance(answer, Refused), answer
 
     def has_permit(self) -> bool:
@@ -381,12 +360,7 @@ class Double:
     async def _beat(self) -> None:
         while True:
             await asyncio.sleep(2.0)
-            held = tuple(
-                worker.HeldLease(
-                    lease_id=lease.lease_id, job_id=lease.job.job_id, attempt=lease.attempt, running=True
-                )
-                for lease in self._held.values()
-            )
+            held = tuple(worker.HeldLease(**_names(lease), running=True) for lease in self._held.values())
             await self._tell("beat", worker.Heartbeat(worker=WORKER, session=self._session, held=held))
 
     async def _work(self) -> None:
@@ -431,38 +405,33 @@ class Double:
             for each in episodes:
                 if each.trajectory is not None and each.trajectory.inline is None:
                     await self._upload(packed_episode(_case_of(lease, each.index)))
-            result = worker.JobResult(
-                lease_id=lease.lease_id,
-                job_id=lease.job.job_id,
-                attempt=lease.attempt,
-                kind="done",
-                episodes=episodes,
-            )
-            await self._tell(
-                "done", worker.ReportResults(worker=WORKER, session=self._session, results=(result,))
-            )
+            results = (worker.JobResult(**_names(lease), kind="done", episodes=episodes),)
+            report = worker.ReportResults(worker=WORKER, session=self._session, results=results)
+            await self._tell("done", report)
             self._held.pop(lease.lease_id, None)
             for case in self.lost & {_case_of(lease, each.index) for each in episodes}:
                 self.world.blobs.delete(digest_of(packed_episode(case)))
 
     async def _upload(self, data: bytes) -> None:
-        message = BlobPut(
-            sender=WORKER, token=self._session, digest=digest_of(data), size=len(data), offset=0, data=data
-        )
-        await self._tell("blob", message)
+        await self._tell("blob", _whole(data, sender=WORKER, token=self._session))
+
+
+def _names(lease: worker.Lease) -> dict[str, Any]:
+    return {"lease_id": lease.lease_id, "job_id": lease.job.job_id, "attempt": lease.attempt}
 
 
 def _case_of(lease: worker.Lease, index: int) -> int:
     return next(spec.case.seed for spec in lease.job.episodes if spec.index == index)
 
 
+def _whole(data: bytes, **sender: str) -> BlobPut:
+    return BlobPut(digest=digest_of(data), size=len(data), offset=0, data=data, **sender)
+
+
 def _write_cases(folder: Path, n_train: int) -> Path:
     first = [HIDDEN_FROM + n for n in (0, N_HIDDEN[0], sum(N_HIDDEN))]
-    for stem, seeds in (
-        ("train", range(n_train)),
-        ("valid", range(*first[:2])),
-        ("heldout", range(*first[1:])),
-    ):
+    splits = {"train": range(n_train), "valid": range(*first[:2]), "heldout": range(*first[1:])}
+    for stem, seeds in splits.items():
         path = folder / "toy_line" / f"{stem}.json"
         path.parent.mkdir(parents=True, exist_ok=True)
         cases = [{"seed": seed} for seed in seeds]
@@ -480,14 +449,8 @@ async def answering(folder: Path, double: Double) -> AsyncIterator[Credentials]:
     try:
         async with transport.serve(config, double.on_queries) as server:
             server.declare([keys.requests(CLUSTER)["gateway"]])
-            yield Credentials(
-                cluster=CLUSTER,
-                role="gateway",
-                endpoints=(endpoint,),
-                user="gateway",
-                password="secret",
-                token=double.capability,
-            )
+            known = {"cluster": CLUSTER, "user": "gateway", "password": "secret", "token": double.capability}
+            yield Credentials(role="gateway", endpoints=(endpoint,), **known)
     finally:
         await double.stop()
 

@@ -17,9 +17,9 @@ def put_program(path: Path, text: str) -> Path:
 
 
 def run_program(*words: str | Path, **more: Any) -> subprocess.CompletedProcess[str]:
-    """The end of a program, whatever its exit status; `more`: of `subprocess.run`."""
-    options = {"capture_output": True, "text": True, "timeout": 120.0, **more}
-    return subprocess.run([*map(str, words)], check=False, **options)
+    """The end of a program, whatever its exit status unless `check`; `more`: of `subprocess.run`."""
+    options = {"capture_output": True, "text": True, "timeout": 120.0, "check": False, **more}
+    return subprocess.run([*map(str, words)], **options)
 
 
 def run_python(code: str, *words: str | Path, **more: Any) -> subprocess.CompletedProcess[str]:

@@ -284,13 +284,8 @@ def afterwards(slots: Slots, reader: JailedReader, wait_s: float, n: int) -> dic
     moved: dict[str, list[float | None]] = {}
     for kind in kinds:
         before = reader.look()
-        parameters = {
-            "way": "all that lasts",
-            "bits": [kind] * 4,
-            "start": time.monotonic() + 0.5,
-            "period": 0.7,
-        }
-        play(slots, parameters)
+        parameters = {"way": "all that lasts", "bits": [kind] * 4, "period": 0.7}
+        play(slots, parameters | {"start": time.monotonic() + 0.5})
         time.sleep(wait_s)
         for name, value in reader.look().items():
             old = before[name]
@@ -313,9 +308,8 @@ def _separated(kinds: list[int], values: list[Any]) -> float:
 def play(slots: Slots, parameters: dict[str, Any]) -> None:
     """One episode of the writer."""
     folder = slots.bundle({"policy.py": WRITER, "given.json": json.dumps(parameters)})
-    (outcome,) = slots.run(
-        slots.slot().play_job(make_job(limits=LIMITS), folder, lambda episodes, steps: None), timeout_s=300.0
-    )
+    playing = slots.slot().play_job(make_job(limits=LIMITS), folder, lambda episodes, steps: None)
+    (outcome,) = slots.run(playing, timeout_s=300.0)
     assert outcome.failure is None, outcome.failure
 
 

@@ -34,9 +34,8 @@ class Listener:
         self._unix = socket.socket(socket.AF_UNIX)
         self._unix.bind("\0" + self.abstract)
         self._unix.listen()
-        self._threads = [
-            threading.Thread(target=self._accept, args=(sock,)) for sock in (self._tcp, self._unix)
-        ]
+        both = (self._tcp, self._unix)
+        self._threads = [threading.Thread(target=self._accept, args=(sock,)) for sock in both]
         for thread in self._threads:
             thread.start()
 
@@ -84,12 +83,8 @@ class Cheated:
         other.mkdir(parents=True)
         (other / "policy.py").write_text(SECRET)
         self.other_run = other / "policy.py"
-        self.environment = {
-            **os.environ,
-            "HOME": str(self.home),
-            "XDG_STATE_HOME": str(root / "xdg"),
-            "OPERATORS_SECRET": SECRET,
-        }
+        own = {"HOME": str(self.home), "XDG_STATE_HOME": str(root / "xdg"), "OPERATORS_SECRET": SECRET}
+        self.environment = {**os.environ, **own}
         _log_in()
         self._stack = contextlib.ExitStack()
         # Runs of one environment stand beside each other here, and one is scored while another's agent listens.

@@ -70,9 +70,9 @@ class Version:
     """The agent's message before it, for the log."""
 
 
-def png(width: int = 48, height: int = 32, seed: int = 0) -> bytes:
+def png(seed: int = 0) -> bytes:
     """A small valid RGB image."""
-    generator = random.Random(seed)
+    generator, width, height = random.Random(seed), 48, 32
     base = [generator.randrange(256) for _ in range(3)]
     rows = b"".join(
         b"\0" + b"".join(bytes(((c + 3 * x + 2 * y) % 256) for c in base) for x in range(width))
@@ -83,9 +83,5 @@ def png(width: int = 48, height: int = 32, seed: int = 0) -> bytes:
         return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
 
     header = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
-    return (
-        b"\x89PNG\r\n\x1a\n"
-        + chunk(b"IHDR", header)
-        + chunk(b"IDAT", zlib.compress(rows))
-        + chunk(b"IEND", b"")
-    )
+    parts = (chunk(b"IHDR", header), chunk(b"IDAT", zlib.compress(rows)), chunk(b"IEND", b""))
+    return b"\x89PNG\r\n\x1a\n" + b"".join(parts)

@@ -29,6 +29,7 @@ SUBMITS = (
     ("ok", 1.5, "and obs[1] ", -90.0),
 )
 """Status, two parts of the policy, validation mean."""
+LOGS = ("harness.log", "agent.jsonl", "env.log")
 
 
 def write_published_run(
@@ -44,7 +45,7 @@ def write_published_run(
     for name in ("workspace/system", "workspace/feedback", "checkpoints", "logs"):
         (folder / name).mkdir(parents=True)
     (folder / "workspace/AGENTS.md").write_text("the rules\n")
-    for name in ("harness.log", "agent.jsonl", "env.log"):
+    for name in LOGS:
         (folder / "logs" / name).write_text("")
     metrics: dict[str, Any] = {}
     scores: dict[str, float] = {}
@@ -59,9 +60,8 @@ def write_published_run(
     best = max(scores, key=lambda name: (scores[name], int(name)), default=None)
     if best is not None:
         checkpoint = folder / "checkpoints" / f"submit_{int(best):03d}"
-        (folder / "workspace/system/policy.py").write_bytes(
-            (checkpoint / "policy.py").read_bytes()
-        )  # line 18
+        policy = (checkpoint / "policy.py").read_bytes()
+        (folder / "workspace/system/policy.py").write_bytes(policy)  # line 18
     trend = (
         *("source_lines", "python_files", "functions", "classes", "cyclomatic_total", "cyclomatic_max"),
         "tree_hash",
@@ -91,9 +91,7 @@ def write_published_run(
             "workspace": "workspace",
             "feedback": "workspace/feedback",
             "checkpoints": "checkpoints",
-            "logs_harness": "logs/harness.log",
-            "logs_agent": "logs/agent.jsonl",
-            "logs_env": "logs/env.log",
+            **{f"logs_{name.partition('.')[0]}": f"logs/{name}" for name in LOGS},
         },
         "versions": {
             "harness": "published",
@@ -127,20 +125,17 @@ def _checkpoint(folder: Path, index: int, status: str, text: str, remaining: int
     complexity = [1, 1, 3 if " and " in text else 2]
     metrics = {
         "schema_version": "0.1",
-        "files": 1,
-        "python_files": 1,
-        "bytes": len(text),
-        "policy_bytes": len(text),
+        **dict.fromkeys(("files", "python_files", "classes"), 1),
+        **dict.fromkeys(("bytes", "policy_bytes"), len(text)),
         "lines": len(lines),
         "source_lines": sum(1 for line in lines if line.strip()),
-        "classes": 1,
         "functions": 3,
         "imports": [],
         "import_count": 0,
-        "cyclomatic_total": sum(complexity),
-        "cyclomatic_max": max(complexity),
         "parse_errors": [],
         "test_files": 0,
+        "cyclomatic_total": sum(complexity),
+        "cyclomatic_max": max(complexity),
         "tree_hash": _hash(b"policy.py\0" + text.encode() + b"\0"),
     }
     (checkpoint / "_meta.json").write_text(json.dumps(meta))

@@ -229,16 +229,8 @@ def _write_replays(folder: Path, replays: Mapping[str, bytes], best: int) -> tup
         path = folder / "replays" / name
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_bytes(data)
-        out.append(
-            Replay(
-                path=f"replays/{name}",
-                split="heldout",
-                episode=number,
-                submit_index=best,
-                episode_return=-80.0 - number,
-                length=100,
-            )
-        )
+        known = {"path": f"replays/{name}", "split": "heldout", "submit_index": best, "length": 100}
+        out.append(Replay(episode=number, episode_return=-80.0 - number, **known))
     return tuple(out)
 
 

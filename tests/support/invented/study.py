@@ -40,13 +40,8 @@ def evolution(generator: random.Random, env: str, skill: float, n_submits: int, 
     history: list[Version] = []
     level = 0.05
     for index in range(n_submits):
-        kind = (
-            "first"
-            if not index
-            else generator.choices(
-                ("parametric", "synthesis", "rollback", "retest", "broken"), (5, 3, 1, 1, 0.6)
-            )[0]
-        )
+        kinds = ("parametric", "synthesis", "rollback", "retest", "broken")
+        kind = generator.choices(kinds, (5, 3, 1, 1, 0.6))[0] if index else "first"
         says = ""
         if kind == "synthesis":
             integral, planner = (
@@ -67,11 +62,8 @@ def evolution(generator: random.Random, env: str, skill: float, n_submits: int, 
         elif kind == "retest" and history:
             files = dict(history[-1].files)
         if kind == "broken":
-            history.append(
-                Version(
-                    {"policy.py": "import nothing_like_this\n"}, (0.0,) * per_submit, None, "import_error"
-                )
-            )
+            files = {"policy.py": "import nothing_like_this\n"}
+            history.append(Version(files, (0.0,) * per_submit, None, "import_error"))
             continue
         if kind != "retest":
             level = min(1.0, max(0.0, level + generator.gauss(0.12 * skill, 0.12)))
@@ -81,9 +73,8 @@ def evolution(generator: random.Random, env: str, skill: float, n_submits: int, 
         noise = abs(high - low) * 0.05
         returns = [val + generator.gauss(0.0, noise) for _ in range(per_submit)]
         images = {"probe.png": png(seed=index)} if index == 2 else {}
-        history.append(
-            Version(files, returns, val, images=images, says=says, failed=(0,) if index == 1 else ())
-        )
+        failed = (0,) if index == 1 else ()
+        history.append(Version(files, returns, val, images=images, says=says, failed=failed))
     return history
 
 

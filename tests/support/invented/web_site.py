@@ -31,12 +31,8 @@ NOBODY = Credentials(
 
 def site_of(*roots: Path, cluster: StatusReply | None = None, **more: Any) -> Site:
     """A view of these folders; `cluster` is what its coordinator has just answered."""
-    site = Site(
-        list(roots),
-        Access(TOKEN, cookie="evopolicy_8765"),
-        credentials=None if cluster is None else NOBODY,
-        **more,
-    )
+    known = None if cluster is None else NOBODY
+    site = Site(list(roots), Access(TOKEN, cookie="evopolicy_8765"), credentials=known, **more)
     if cluster is not None:
         site.cluster.take_status(cluster)
     return site
@@ -53,16 +49,8 @@ def client(site: Site, *, signed_in: bool = True) -> TestClient:
 
 def status(*runs: RunStatus, workers: tuple[WorkerStatus, ...] = (), **more: Any) -> StatusReply:
     """A status as a coordinator may send it."""
-    return StatusReply(
-        cluster="c",
-        version="1",
-        uptime_s=60.0,
-        episodes_done=1,
-        episodes_per_s=0.5,
-        workers=workers,
-        runs=runs,
-        **more,
-    )
+    more |= {"cluster": "c", "version": "1", "uptime_s": 60.0, "episodes_done": 1, "episodes_per_s": 0.5}
+    return StatusReply(workers=workers, runs=runs, **more)
 
 
 def open_status(run: str, env: str = "gym/acrobot", **more: Any) -> RunStatus:
@@ -89,9 +77,8 @@ def open_run(
     folder = runs / entry / env.replace("/", "_") / exp_id
     usual = RunSettings(env=env, entry=entry, model="m", exp_id=exp_id, budget=128)
     wanted = msgspec.structs.replace(usual, **(settings or {}))
-    bundle = pack(
-        [BundleFile(path, False, data) for path, data in sorted((files or {"policy.py": b"x = 1\n"}).items())]
-    )
+    kept = sorted((files or {"policy.py": b"x = 1\n"}).items())
+    bundle = pack([BundleFile(path, False, data) for path, data in kept])
     state = folder / ".gateway"
     (state / "bundles" / bundle.digest[:2]).mkdir(parents=True)
     (state / "bundles" / bundle.digest[:2] / bundle.digest).write_bytes(bundle.packed)
@@ -104,15 +91,9 @@ def open_run(
     (folder / "logs" / "agent.jsonl").write_text("".join(json.dumps(line) + "\n" for line in log or []))
     episode = folder / "workspace" / "feedback" / "submit_000" / "episodes" / "ep_000"
     episode.mkdir(parents=True)
-    row = {
-        "t": 0,
-        "obs": [0.5, 1.0],
-        "action": [1.0],
-        "reward": -1.0,
-        "terminated": False,
-        "truncated": False,
-    }
-    (episode / "trajectory.jsonl").write_text(json.dumps(row) + "\n" + json.dumps({**row, "t": 1}) + "\n")
+    row = {"obs": [0.5, 1.0], "action": [1.0], "reward": -1.0, "terminated": False, "truncated": False}
+    rows = "".join(json.dumps({"t": t, **row}) + "\n" for t in (0, 1))
+    (episode / "trajectory.jsonl").write_text(rows)
     summary = {
         "schema_version": "0.1", "submit_index": 0, "env": env, "status": "ok", "n_episodes": 1,
         "first_global_episode": 0,
@@ -125,7 +106,7 @@ def open_run(
     return folder
 
 
-def finished_run(runs: Path, *, score: float = 4242.5, **more: Any) -> Path:
+def finished_run(runs: Path, **more: Any) -> Path:
     """A finished run whose held-out score is a number that stands nowhere else."""
     version = Version(files={"policy.py": "x = 1\n"}, returns=(-100.0,) * 4, val=-111.25)
-    return write_run(runs, [version], heldout=[score], random_mean=-4322.5, **more)
+    return write_run(runs, [version], heldout=[4242.5], random_mean=-4322.5, **more)

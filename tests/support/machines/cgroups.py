@@ -15,6 +15,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from unittest import SkipTest
 
+from program_runs import run_program
+
 from evopolicy_common.processes.cgroups import ROOT, hierarchies
 
 TIMEOUT_S = 10.0
@@ -148,9 +150,7 @@ def _folder(root: Path) -> Path:
 @contextlib.contextmanager
 def _mounted(controller: str) -> Iterator[Path]:
     with tempfile.TemporaryDirectory(prefix="evp-cgroup-") as folder:
-        done = subprocess.run(
-            ["mount", "-t", "cgroup", "-o", controller, "none", folder], capture_output=True, text=True
-        )
+        done = run_program("mount", "-t", "cgroup", "-o", controller, "none", folder)
         if done.returncode:
             raise NoCgroupError(done.stderr.strip())
         try:

@@ -11,12 +11,12 @@ import socket
 import subprocess
 import tempfile
 import time
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import psycopg
 import pytest
+from program_runs import run_program
 
 _USER = "nobody"
 """As root the server runs as this user: PostgreSQL refuses root."""
@@ -56,17 +56,8 @@ class Server:
         password.chmod(0o644)
         data = ("-D", str(self.root / "data"), "--no-sync")
         if follows is None:
-            how = (
-                "-U",
-                "evopolicy",
-                "-A",
-                "scram-sha-256",
-                f"--pwfile={password}",
-                "-E",
-                "UTF8",
-                "--locale=C.UTF-8",
-            )
-            self._run("initdb", *data, *how)
+            how = ("-U", "evopolicy", "-A", "scram-sha-256", f"--pwfile={password}")
+            self._run("initdb", *data, *how, "-E", "UTF8", "--locale=C.UTF-8")
             with (self.root / "data" / "pg_hba.conf").open("a") as rules:
                 rules.write(f"host all all {net} scram-sha-256\n" if net else "")
         else:
@@ -109,9 +100,7 @@ class Server:
 
     def kill(self) -> None:
         """All its processes at once, as in a power cut."""
-        found = subprocess.run(
-            ["ps", "--ppid", str(self.process.pid), "-o", "pid="], capture_output=True, check=False
-        )
+        found = run_program("ps", "--ppid", str(self.process.pid), "-o", "pid=")
         for pid in (self.process.pid, *map(int, found.stdout.split())):
             os.kill(pid, signal.SIGKILL)
         self.process.wait()
@@ -147,6 +136,5 @@ class Server:
             return found.fetchall() if found.description else []
 
     def _run(self, program: str, *args: str) -> None:
-        command: Sequence[str | Path] = [self._programs / program, *args]
-        done = subprocess.run(command, capture_output=True, cwd="/", check=False, **self._owner)
-        assert done.returncode == 0, done.stderr.decode()
+        done = run_program(self._programs / program, *args, cwd="/", **self._owner)
+        assert done.returncode == 0, done.stderr

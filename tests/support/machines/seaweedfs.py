@@ -37,13 +37,11 @@ class ObjectStore:
         self._ports = {name: probe.getsockname()[1] for name, probe in zip(_PORTS, probes, strict=True)}
         for probe in probes:
             probe.close()
-        identities = [
-            _identity("writer", "Admin", "Read", "Write", "List"),
-            _identity("reader", "Read", "List"),
-        ]
         self._options = options
         self._config = config or self.root / "s3.json"
         if config is None:
+            writer = _identity("writer", "Admin", "Read", "Write", "List")
+            identities = [writer, _identity("reader", "Read", "List")]
             self._config.write_text(json.dumps({"identities": identities}))
         self.keys, self.reading = self._environment("writer"), self._environment("reader")
         self._n = 0

@@ -26,9 +26,7 @@ class WeakLink:
         self._upstream = upstream
         self._open: set[socket.socket] = set()
         self._lock = threading.Lock()
-        self._cut = False
-        self._slow = False
-        self._reordered = False
+        self._how: How | None = None
         self._flows = threading.Event()
         self._flows.set()
         self._listener = _socket(address)
@@ -40,19 +38,15 @@ class WeakLink:
     def weak(self, how: How) -> Iterator[None]:
         """Cut: connections end and none begins. Stalled: nothing passes, and nobody is told. Slow: all comes late.
         Reordered: each piece arrives with its halves exchanged."""
+        self._how = how
         if how == "cut":
-            self._cut = True
             self._end_all()
         elif how == "stalled":
             self._flows.clear()
-        elif how == "slow":
-            self._slow = True
-        else:
-            self._reordered = True
         try:
             yield
         finally:
-            self._cut = self._slow = self._reordered = False
+            self._how = None
             self._flows.set()
 
     @property
@@ -82,7 +76,7 @@ class WeakLink:
                 return
             far = _socket(self._upstream)
             try:
-                if self._cut:
+                if self._how == "cut":
                     raise ConnectionRefusedError
                 far.connect(_name(self._upstream))
             except OSError:
@@ -100,9 +94,9 @@ class WeakLink:
             while data := source.recv(1 << 16):
                 self.carried(data, outward=outward)
                 self._flows.wait()
-                if self._slow:
+                if self._how == "slow":
                     time.sleep(SLOW_S)
-                if self._reordered:
+                if self._how == "reordered":
                     data = data[len(data) // 2 :] + data[: len(data) // 2]
                 target.sendall(data)
         # Either way down takes the other with it; the last one closes.

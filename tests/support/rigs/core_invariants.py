@@ -23,21 +23,14 @@ def check_invariants(state: State) -> None:
         phase = run.state.phase
         want(run.id, RUN[phase], "only unfinished runs are open")
         unsettled = [row.submit_index for row in run.submits if SUBMIT[row.status or "open"]]
-        want(
-            run.id,
-            unsettled == ([] if run.open is None else [run.open]),
-            "only the open submit lacks a verdict",
-        )
+        is_open = [] if run.open is None else [run.open]
+        want(run.id, unsettled == is_open, "only the open submit lacks a verdict")
         want(run.id, (run.open is not None) == (run.ledger.reserved > 0), "an open submit has a reservation")
         if run.open is not None:
-            want(
-                run.id,
-                submit_group(run.id, run.open, "train") in state.groups,
-                "an open submit has its group",
-            )
-        settled = sum(
-            len(row.env_instances) for row in run.submits if row.status is not None and not row.refunded
-        )
+            group_of = submit_group(run.id, run.open, "train")
+            want(run.id, group_of in state.groups, "an open submit has its group")
+        ended = [row for row in run.submits if row.status is not None and not row.refunded]
+        settled = sum(len(row.env_instances) for row in ended)
         want(run.id, settled == run.ledger.settled, "the settled episodes are those of the ended submits")
 
 
@@ -58,10 +51,8 @@ def _isolation(state: State) -> None:
     for worker in state.workers.values():
         for lease in worker.leases.values():
             group = lease.job.group
-            wanted = group.hidden or group.kind == "train"
-            want(
-                lease.id, (lease.occupancy is not None) == wanted, "hidden and train leases have occupancies"
-            )
+            there = (lease.occupancy is not None) == (group.hidden or group.kind == "train")
+            want(lease.id, there, "hidden and train leases have occupancies")
     flows = {group.flow for group in state.groups.values()}
     flows |= {run.flow for run in state.runs.values()} | {each.flow for each in state.evaluations.values()}
     users = Counter(flow.case_set for flow in flows if flow.case_set is not None)
@@ -72,11 +63,8 @@ def _isolation(state: State) -> None:
         want("", case_set.users == users[case_set], "a case set is kept while it has users")
     for group in state.groups.values():
         run = state.runs.get(group.run)
-        want(
-            group.id,
-            not (run and group.hidden and run.state.phase == "open"),
-            "an open run plays nothing hidden",
-        )
+        early = run and group.hidden and run.state.phase == "open"
+        want(group.id, not early, "an open run plays nothing hidden")
     for group in state.held:
         want(group.id, group.held_since is not None and not group.closed, "only open groups are held")
 
@@ -91,9 +79,8 @@ def _jobs(state: State) -> None:
     live = 0
     ready: dict[JobState, None] = {}
     for flow in {group.flow for group in state.groups.values()}:
-        ready |= {
-            job: None for line in flow.ready for generation, job in line if generation == job.generation
-        }
+        current = (job for line in flow.ready for generation, job in line if generation == job.generation)
+        ready |= dict.fromkeys(current)
     ends = not state.adopting or ("adopt", "") in state.timers
     want("", ends, "a job that waits for adoption has a deadline")
     for group in state.groups.values():

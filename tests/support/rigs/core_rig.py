@@ -68,18 +68,9 @@ def fingerprint(version: str = "1", packages: dict[str, str] | None = None) -> w
 
 
 def outcome_of(index: int, value: float = 1.0, failure: FailureCategory | None = None) -> EpisodeOutcome:
-    failed = (
-        None if failure is None else PolicyFailure(category=failure, step_index=None, message="it failed")
-    )
-    return EpisodeOutcome(
-        index=index,
-        episode_return=value,
-        length=3,
-        terminated=True,
-        truncated=False,
-        failure=failed,
-        wall_s=1.0,
-    )
+    failed = failure and PolicyFailure(category=failure, step_index=None, message="it failed")
+    values = {"length": 3, "terminated": True, "truncated": False, "wall_s": 1.0}
+    return EpisodeOutcome(index=index, episode_return=value, failure=failed, **values)
 
 
 def key_of(row: Row) -> tuple[Any, ...]:
@@ -143,7 +134,7 @@ class Rig:
         """Send a message with the fields that the shell adds; gives the answer, None while it waits."""
         return self.tell(asked(kind, request=self.request(), **fields))
 
-    def pass_time(self, seconds: float, step_s: float = 0.5) -> None:
+    def pass_time(self, seconds: float) -> None:
         """Let time pass, serving every deadline when it is due."""
         until = self.now + seconds
         while True:
@@ -296,16 +287,14 @@ class Rig:
     def close(self, run: str = "r1") -> Any:
         return self.ask(gateway.CloseRun, run=run, reason="budget_spent")
 
-    def work_off(self, session: str, values: Any = lambda job: 1.0, rounds: int = 10_000) -> int:
+    def work_off(self, session: str, values: Any = lambda job: 1.0) -> int:
         """Let one worker play all there is; gives the number of jobs."""
         n = 0
-        for _ in range(rounds):
-            leases = self.poll(session, n=4)
-            if not leases:
-                return n
+        while leases := self.poll(session, n=4):
             n += len(leases)
             self.report_results(session, *(done(lease, values(lease.job)) for lease in leases))
-        raise AssertionError("there is no end to the work")
+            assert n <= 40_000, "there is no end to the work"
+        return n
 
     def finish(self, session: str, values: Any = lambda job: 1.0) -> RunFinished:
         """Close run r1, let one worker play all there is, and give the run's result."""
@@ -331,6 +320,13 @@ class Rig:
     def status(self) -> StatusReply:
         """An operator's view of the status."""
         return self.core.status(self.now, reason_text)
+
+    def restarted(self, **worker: Any) -> str:
+        """Another core from what is stored, with worker w1 of eight slots, once leases may have been adopted."""
+        self.load()
+        session = self.register(**{"slots": 8, **worker})
+        self.pass_time(self.settings.adoption_s)
+        return session
 
     def row(self, kind: type[T], *key: Any) -> T:
         row = self.rows[(kind, *key)]

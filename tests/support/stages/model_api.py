@@ -13,13 +13,16 @@ import json
 import re
 import threading
 from collections.abc import Callable, Iterator, Sequence
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from http.server import BaseHTTPRequestHandler
 from pathlib import Path
 from typing import Any
 
 from stages.declared_inputs import as_toml
+from stages.loopback import Loopback
+from stages.provider_api import CACHED, FRESH, OUTPUT, chat_usage, gemini_usage, responses_usage
+from stages.provider_api import REASONING as REASONING
 
-INPUT, CACHED, CREATED, OUTPUT, REASONING = 1000, 700, 50, 20, 5
+INPUT, CREATED = FRESH + CACHED, 50
 """Tokens that every answer claims. OpenAI counts the cached ones into its input, Anthropic apart."""
 
 
@@ -73,7 +76,7 @@ class Step:
         return _offered(offered), _shell_arguments(self.command or "")
 
 
-class ModelApi:
+class ModelApi(Loopback):
     """Serves while the `with` lasts. `base_url` is without `/v1`."""
 
     def __init__(self, script: Sequence[Step]) -> None:
@@ -117,21 +120,7 @@ class ModelApi:
                 if self.command != "HEAD":
                     self.wfile.write(data)
 
-        self._server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
-        self._thread = threading.Thread(target=self._server.serve_forever, daemon=True)
-
-    @property
-    def base_url(self) -> str:
-        return f"http://127.0.0.1:{self._server.server_address[1]}"
-
-    def __enter__(self) -> ModelApi:
-        self._thread.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._server.shutdown()
-        self._server.server_close()
-        self._thread.join()
+        super().__init__(Handler)
 
     def answer(self, handler: Any, request: dict[str, Any]) -> None:
         path = handler.path.partition("?")[0]
@@ -241,13 +230,7 @@ def _chat_with(
     whole = {"id": identity, "object": "chat.completion.chunk", "model": request["model"]}
     yield whole | {"choices": [{"index": 0, "delta": delta, "finish_reason": None}]}
     yield whole | {"choices": [{"index": 0, "delta": {}, "finish_reason": reason}]}
-    usage = {
-        "prompt_tokens": INPUT,
-        "completion_tokens": OUTPUT,
-        "total_tokens": INPUT + OUTPUT,
-        "prompt_tokens_details": {"cached_tokens": CACHED},
-    }
-    yield whole | {"choices": [], "usage": usage}
+    yield whole | {"choices": [], "usage": chat_usage()}
 
 
 def _qwen_tool(name: str, request: dict[str, Any]) -> str | None:
@@ -264,15 +247,8 @@ def _contents(step: Step, request: dict[str, Any]) -> Iterator[dict[str, Any]]:
         declared = [one["name"] for tool in request["tools"] for one in tool.get("functionDeclarations", ())]
         name, arguments = step.call(declared, request)
         part = {"functionCall": {"name": name, "args": arguments}}
-    usage = {
-        "promptTokenCount": INPUT,
-        "cachedContentTokenCount": CACHED,
-        "candidatesTokenCount": OUTPUT - REASONING,
-        "thoughtsTokenCount": REASONING,
-        "totalTokenCount": INPUT + OUTPUT,
-    }
     candidate = {"content": {"role": "model", "parts": [part]}, "finishReason": "STOP", "index": 0}
-    yield {"candidates": [candidate], "usageMetadata": usage}
+    yield {"candidates": [candidate], "usageMetadata": gemini_usage()}
 
 
 def _offered(names: list[str]) -> str:
@@ -296,17 +272,11 @@ def _responses(step: Step, request: dict[str, Any]) -> Iterator[dict[str, Any]]:
 
 
 def _responses_with(identity: str, *items: dict[str, Any]) -> Iterator[dict[str, Any]]:
-    usage = {
-        "input_tokens": INPUT,
-        "input_tokens_details": {"cached_tokens": CACHED},
-        "output_tokens": OUTPUT,
-        "output_tokens_details": {"reasoning_tokens": REASONING},
-        "total_tokens": INPUT + OUTPUT,
-    }
     yield {"type": "response.created", "response": {"id": identity}}
     for n, item in enumerate(items):
         yield {"type": "response.output_item.done", "output_index": n, "item": item}
-    yield {"type": "response.completed", "response": {"id": identity, "output": list(items), "usage": usage}}
+    response = {"id": identity, "output": list(items), "usage": responses_usage()}
+    yield {"type": "response.completed", "response": response}
 
 
 def _codex_call(step: Step, request: dict[str, Any]) -> dict[str, Any]:
@@ -348,12 +318,8 @@ def _shell_call(command: str, request: dict[str, Any]) -> tuple[str, dict[str, A
 
 
 def _messages(step: Step, request: dict[str, Any]) -> Iterator[dict[str, Any]]:
-    usage = {
-        "input_tokens": INPUT - CACHED,
-        "cache_read_input_tokens": CACHED,
-        "cache_creation_input_tokens": CREATED,
-        "output_tokens": 1,
-    }
+    usage = {"input_tokens": FRESH, "cache_read_input_tokens": CACHED, "output_tokens": 1}
+    usage |= {"cache_creation_input_tokens": CREATED}
     message = {"id": f"msg_{id(step)}", "type": "message", "role": "assistant", "model": request["model"]}
     message |= {"content": [], "stop_reason": None, "stop_sequence": None, "usage": usage}
     yield {"type": "message_start", "message": message}

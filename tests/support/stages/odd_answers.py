@@ -33,12 +33,7 @@ def busy(status: int = 429, **headers: str) -> Odd:
 
     def answer(handler: Any, _: dict[str, Any]) -> None:
         body = json.dumps({"error": {"type": "rate_limit_error", "message": "slow down"}}).encode()
-        handler.send_response(status)
-        for name, value in {"content-type": "application/json", **headers}.items():
-            handler.send_header(name.replace("_", "-"), value)
-        handler.send_header("content-length", str(len(body)))
-        handler.end_headers()
-        handler.wfile.write(body)
+        _send(handler, status, body, **{name.replace("_", "-"): value for name, value in headers.items()})
 
     return answer
 
@@ -80,19 +75,25 @@ def says(text: str, end: bool = True) -> dict[str, Any]:
 
 def bomb(handler: Any, _: dict[str, Any]) -> None:
     """Few bytes that unpack to very many."""
-    data = gzip.compress(b" " * BOMB_BYTES, 1)
-    handler.send_response(200)
-    handler.send_header("content-type", "application/json")
-    handler.send_header("content-encoding", "gzip")
-    handler.send_header("content-length", str(len(data)))
-    handler.end_headers()
-    handler.wfile.write(data)
+    _send(handler, 200, gzip.compress(b" " * BOMB_BYTES, 1), **{"content-encoding": "gzip"})
 
 
 def repeats_its_headers(handler: Any, _: dict[str, Any]) -> None:
     """An error that repeats the key, as some servers do."""
     text = json.dumps({"error": {"message": f"bad request: {dict(handler.headers)}"}}).encode()
     handler._send(400, text, "application/json")
+
+
+def _send(handler: Any, status: int, body: bytes, **headers: str) -> None:
+    handler.send_response(status)
+    for name, value in {
+        "content-type": "application/json",
+        **headers,
+        "content-length": str(len(body)),
+    }.items():
+        handler.send_header(name, value)
+    handler.end_headers()
+    handler.wfile.write(body)
 
 
 def _chunk(handler: Any, data: bytes) -> None:

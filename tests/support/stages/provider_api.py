@@ -10,16 +10,18 @@ import json
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from http.server import BaseHTTPRequestHandler
 from typing import Any
+
+from stages.loopback import Loopback
 
 Document = dict[str, Any]
 Refuses = Callable[[Document], tuple[Any, ...] | None]
 """A request's document → status and body of an error, perhaps with its headers, or None."""
 Sends = Callable[["ProviderApi", Any, Document, "Said"], bool]
 """Writes an answer of its own to the server's handler; False: the usual one is sent."""
-FRESH, CACHED, OUTPUT = 300, 700, 20
-"""Tokens that every answer claims: input without the cached ones, cached input, output."""
+FRESH, CACHED, OUTPUT, REASONING = 300, 700, 20, 5
+"""Tokens that every answer claims: input without the cached ones, cached input, output, reasoning in it."""
 
 
 def conversation_settings(base_url: str, api: str = "chat", **more: Any) -> dict[str, Any]:
@@ -41,14 +43,8 @@ class Said:
 
 
 def _chat_message(said: Said, n: int) -> Document:
-    calls = [
-        {
-            "id": f"call_{n}_{at}",
-            "type": "function",
-            "function": {"name": "bash", "arguments": json.dumps({"command": command})},
-        }
-        for at, command in enumerate(said.commands)
-    ]
+    functions = ({"name": "bash", "arguments": json.dumps({"command": each})} for each in said.commands)
+    calls = [{"id": f"call_{n}_{at}", "type": "function", "function": f} for at, f in enumerate(functions)]
     message: Document = {"role": "assistant", "content": said.text or None}
     message |= {"reasoning_content": said.reasoning} if said.reasoning else {}
     return message | ({"tool_calls": calls} if calls else {})
@@ -67,6 +63,18 @@ def chat_usage() -> Document:
     both = FRESH + CACHED
     details = {"prompt_tokens_details": {"cached_tokens": CACHED}}
     return {"prompt_tokens": both, "completion_tokens": OUTPUT, "total_tokens": both + OUTPUT, **details}
+
+
+def responses_usage() -> Document:
+    known = {"input_tokens": FRESH + CACHED, "input_tokens_details": {"cached_tokens": CACHED}}
+    known |= {"output_tokens": OUTPUT, "output_tokens_details": {"reasoning_tokens": REASONING}}
+    return known | {"total_tokens": FRESH + CACHED + OUTPUT}
+
+
+def gemini_usage() -> Document:
+    known = {"promptTokenCount": FRESH + CACHED, "cachedContentTokenCount": CACHED}
+    known |= {"candidatesTokenCount": OUTPUT - REASONING, "thoughtsTokenCount": REASONING}
+    return known | {"totalTokenCount": FRESH + CACHED + OUTPUT}
 
 
 def _chat_document(message: Document, said: Said, model: str) -> Document:
@@ -92,9 +100,8 @@ def _chat_events(message: Document, said: Said, model: str) -> Iterator[Document
         if not isinstance(whole, str):
             yield chat_chunk({"tool_calls": [call | {"index": at}]})
             continue
-        yield chat_chunk(
-            {"tool_calls": [call | {"index": at, "function": call["function"] | {"arguments": ""}}]}
-        )
+        begun = call | {"index": at, "function": call["function"] | {"arguments": ""}}
+        yield chat_chunk({"tool_calls": [begun]})
         for piece in (whole[:5], whole[5:]):
             yield chat_chunk({"tool_calls": [{"index": at, "function": {"arguments": piece}}]})
     yield chat_chunk({}, said.finish or ("tool_calls" if said.commands else "stop"))
@@ -117,13 +124,7 @@ def _responses_message(said: Said, n: int) -> Document:
 
 
 def _responses_document(message: Document, said: Said, model: str) -> Document:
-    usage = {
-        "input_tokens": FRESH + CACHED,
-        "input_tokens_details": {"cached_tokens": CACHED},
-        "output_tokens": OUTPUT,
-        "output_tokens_details": {"reasoning_tokens": 5},
-        "total_tokens": FRESH + CACHED + OUTPUT,
-    }
+    usage = responses_usage()
     known = {"id": "resp", "object": "response", "created_at": 1, "model": model, "status": "completed"}
     known |= {"parallel_tool_calls": True, "tool_choice": "auto", "tools": [], "usage": usage}
     if said.finish:
@@ -133,23 +134,16 @@ def _responses_document(message: Document, said: Said, model: str) -> Document:
 
 def _responses_events(message: Document, said: Said, model: str) -> Iterator[Document]:
     whole = _responses_document(message, said, model)
-    yield {
-        "type": "response.created",
-        "response": whole | {"output": [], "usage": None, "status": "in_progress"},
-    }
+    response = whole | {"output": [], "usage": None, "status": "in_progress"}
+    yield {"type": "response.created", "response": response}
     for at, item in enumerate(message["output"]):
         known = {"output_index": at, "item_id": item["id"]}
         begun = item | {"status": "in_progress"} | ({"arguments": ""} if "arguments" in item else {})
         yield {"type": "response.output_item.added", "output_index": at, "item": begun | {"content": []}}
         if item["type"] == "message":
-            part = item["content"][0]
-            yield {
-                "type": "response.content_part.added",
-                "content_index": 0,
-                "part": part | {"text": ""},
-                **known,
-            }
-            yield {"type": "response.output_text.delta", "content_index": 0, "delta": said.text, **known}
+            part, known = item["content"][0] | {"text": ""}, known | {"content_index": 0}
+            yield {"type": "response.content_part.added", "part": part, **known}
+            yield {"type": "response.output_text.delta", "delta": said.text, **known}
         elif item["type"] == "function_call":
             for piece in (item["arguments"][:5], item["arguments"][5:]):
                 yield {"type": "response.function_call_arguments.delta", "delta": piece, **known}
@@ -161,14 +155,12 @@ def _responses_events(message: Document, said: Said, model: str) -> Iterator[Doc
 def _messages_message(said: Said, n: int) -> Document:
     blocks: list[Document] = []
     if said.reasoning:
-        blocks.append(
-            {"type": "thinking", "thinking": said.reasoning, "signature": f"signed({said.reasoning})"}
-        )
+        signature = f"signed({said.reasoning})"
+        blocks.append({"type": "thinking", "thinking": said.reasoning, "signature": signature})
     blocks += [{"type": "text", "text": said.text}] if said.text else []
     for at, command in enumerate(said.commands):
-        blocks.append(
-            {"type": "tool_use", "id": f"toolu_{n}_{at}", "name": "bash", "input": {"command": command}}
-        )
+        block = {"type": "tool_use", "id": f"toolu_{n}_{at}", "name": "bash"}
+        blocks.append(block | {"input": {"command": command}})
     return {"role": "assistant", "content": blocks}
 
 
@@ -213,15 +205,9 @@ def _gemini_message(said: Said, n: int) -> Document:
 
 
 def _gemini_document(message: Document, said: Said, model: str) -> Document:
-    usage = {
-        "promptTokenCount": FRESH + CACHED,
-        "cachedContentTokenCount": CACHED,
-        "candidatesTokenCount": OUTPUT - 5,
-        "thoughtsTokenCount": 5,
-        "totalTokenCount": FRESH + CACHED + OUTPUT,
-    }
     candidate = {"content": message, "finishReason": said.finish or "STOP", "index": 0}
-    return {"candidates": [candidate], "usageMetadata": usage, "modelVersion": model, "responseId": "g"}
+    known = {"candidates": [candidate], "usageMetadata": gemini_usage()}
+    return known | {"modelVersion": model, "responseId": "g"}
 
 
 def _gemini_events(message: Document, said: Said, model: str) -> Iterator[Document]:
@@ -267,7 +253,7 @@ def _holds(got: Any, sent: Any) -> bool:
     return bool(got == sent)
 
 
-class ProviderApi:
+class ProviderApi(Loopback):
     """Serves while the `with` lasts. `base_url` is as the vendor's library takes it."""
 
     def __init__(
@@ -300,9 +286,8 @@ class ProviderApi:
                 pass
 
             def do_GET(self) -> None:
-                self.send(
-                    200, {"object": "list", "data": [{"id": name, "object": "model"} for name in models]}
-                )
+                listed = [{"id": name, "object": "model"} for name in models]
+                self.send(200, {"object": "list", "data": listed})
 
             def do_POST(self) -> None:
                 request = json.loads(self.rfile.read(int(self.headers["content-length"])))
@@ -341,19 +326,8 @@ class ProviderApi:
                 self.end_headers()
                 self.wfile.write(data)
 
-        self._server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
-        self._thread = threading.Thread(target=self._server.serve_forever, kwargs={"poll_interval": 0.01})
-        self.base_url = f"http://127.0.0.1:{self._server.server_address[1]}"
+        super().__init__(Handler)
         self.base_url += "" if api in ("messages", "gemini") else "/v1"
-
-    def __enter__(self) -> ProviderApi:
-        self._thread.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._server.shutdown()
-        self._server.server_close()
-        self._thread.join()
 
     def answer(self, handler: Any, request: Document, said: Said, streamed: bool) -> None:
         """Sends the next answer of the script, which counts as said."""

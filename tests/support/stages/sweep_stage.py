@@ -30,6 +30,7 @@ from evopolicy_gateway.suite.suite_file import SuiteFile, expand, read_suite
 from evopolicy_gateway.suite.suite_view import SuiteView
 
 TIMEOUT_S = 30.0
+NOBODY = Credentials(cluster="c", role="gateway", endpoints=("tcp/h:1",), user="u", password="p", token="t")
 HEAD = 'name = "s"\nenvironments = ["toy/line"]\n'
 CODEX = '[[agents]]\nname = "{}"\n[agents.config]\nharness = "codex"\n'
 EVOLVE = '[[agents]]\nname = "{}"\nagent = "evolve"\n'
@@ -158,16 +159,7 @@ class Stage:
 
     def play(self) -> Index:
         """Plays the sweep; the index as it is on disk afterwards."""
-        played = ClaimedSweep(
-            self.suite,
-            self.root,
-            self.index,
-            self.cluster,
-            Credentials(
-                role="gateway", endpoints=("tcp/h:1",), cluster="c", user="u", password="p", token="t"
-            ),
-            self.view,
-        )
+        played = ClaimedSweep(self.suite, self.root, self.index, self.cluster, NOBODY, self.view)
         facts = self.facts or Facts()
         known = [msgspec.structs.replace(facts, entry=self.index.runs.get(run.name)) for run in self.runs]
         decided = [decide(run, each) for run, each in zip(self.runs, known, strict=True)]
@@ -179,8 +171,18 @@ class Stage:
         asyncio.run(main())
         return suite_index.load(self.root, "s")
 
+    def complete(self) -> Index:
+        """The same of a sweep whose runs all complete."""
+        index = self.play()
+        assert {entry.state for entry in index.runs.values()} == {"completed"}
+        return index
+
 
 Staged = Callable[..., Stage]
+
+
+async def never(_: str) -> None:
+    await asyncio.Event().wait()
 
 
 class Direct:

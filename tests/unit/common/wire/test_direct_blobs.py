@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import threading
 import time
 from collections.abc import Iterator
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from http.server import BaseHTTPRequestHandler
 from pathlib import Path
 from typing import Any, ClassVar
 
 import pytest
+from stages.loopback import Loopback
 
 from evopolicy_common.errors import ProtocolError
 from evopolicy_common.messages.worker import BlobChunk, BlobGet
@@ -51,12 +51,8 @@ class Store(BaseHTTPRequestHandler):
 @pytest.fixture
 def store() -> Iterator[str]:
     Store.asked.clear()
-    with ThreadingHTTPServer(("127.0.0.1", 0), Store) as server:
-        thread = threading.Thread(target=server.serve_forever)
-        thread.start()
-        yield f"http://127.0.0.1:{server.server_port}"
-        server.shutdown()
-        thread.join()
+    with Loopback(Store) as server:
+        yield server.base_url
 
 
 class Coordinator(Requester[Any]):

@@ -68,9 +68,7 @@ def test_an_excluded_checkpoint_stays_excluded_after_a_restart(rig: Rig) -> None
         for lease in rig.poll(session, 8):
             failure = FAILURE if split_of(lease.job) == "validation" else None
             rig.report_results(session, done(lease, 1.0, failure))
-    rig.load()
-    session = rig.register()
-    rig.pass_time(rig.settings.adoption_s)
+    session = rig.restarted(slots=2)
     play_off(rig, session, lambda job: (1.0, False))
     assert rig.finished().status == "no_ok_submit"
 

@@ -44,9 +44,7 @@ def test_a_stopped_job_continues_from_its_policys_actions(rig: Rig, restart: boo
     for begun in (BEGUN, LONGER):
         given_back(rig, session, lease, begun)
         if restart:
-            rig.load()
-            session = rig.register()
-            rig.pass_time(rig.settings.adoption_s)
+            session = rig.restarted(slots=2)
         lease = the_hidden_one(rig, session)
         assert lease.job.begun == begun
         assert rig.core.state.jobs[lease.job.job_id].names_blob(begun.digest)

@@ -64,9 +64,7 @@ def test_nothing_hidden_is_leased_where_a_related_agent_may_be_alive(rig: Rig, r
     session = scored(rig)
     rig.create("r1", agent=HERE)
     if restart:
-        rig.load()
-        session = rig.register(slots=8)
-        rig.pass_time(rig.settings.adoption_s)
+        session = rig.restarted()
     assert splits(rig.poll(session, 8)) == {"random"}
     assert "alive" in rig.status().workers[0].hidden_bar
     other = rig.register("w2", slots=8)
@@ -142,9 +140,7 @@ def test_an_open_run_plays_nothing_hidden(rig: Rig) -> None:
     session = rig.begin(0, worker={"slots": 8}, run={"agent": "remote"})
     rig.play(session, *rig.poll(session))
     assert rig.poll(session, 8) == []
-    rig.load()
-    session = rig.register(slots=8)
-    rig.pass_time(rig.settings.adoption_s)
+    session = rig.restarted()
     assert rig.poll(session, 8) == []
     rig.close()
     assert splits(rig.poll(session, 8)) == {"validation", "random"}
@@ -163,9 +159,7 @@ def test_each_submit_is_validated_once_equal_bundles_too(rig: Rig, restart: bool
         jobs.update(lease.job.job_id for lease in leases)
         rig.play(session, *leases)
         if restart:
-            rig.load()
-            session = rig.register(slots=8)
-            rig.pass_time(rig.settings.adoption_s)
+            session = rig.restarted()
     validated = {job: n for job, n in jobs.items() if "/validation/" in job}
     assert validated == {f"r1/s{index}/validation/{case}": 1 for index in (0, 1) for case in (0, 1)}
     assert rig.finished().status == "completed"
@@ -263,9 +257,7 @@ def test_a_cancelled_runs_permit_ends_by_its_gateway_or_time(
     rig.create("r1", agent=HERE)
     rig.ask(operator.CancelRun, run="r1")
     if restart:
-        rig.load()
-        session = rig.register(slots=8)
-        rig.pass_time(rig.settings.adoption_s)
+        session = rig.restarted()
     assert "validation" not in splits(rig.poll(session, 2))
     if confirmed:
         rig.close("r1")

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import asyncio
 from pathlib import Path
 
 import msgspec
 import pytest
 from rigs.finished_run import mark_opened
-from stages.sweep_stage import CODEX, EVOLVE, TOKENS, Staged, entry_of, until
+from stages.sweep_stage import CODEX, EVOLVE, TOKENS, Staged, entry_of, never, until
 
 from evopolicy_common.errors import EvopolicyError
 from evopolicy_common.messages.operator import ClaimState
@@ -17,8 +16,7 @@ from evopolicy_gateway.suite.decisions import Decision, Facts, decide
 
 
 def test_an_open_run_is_announced_to_the_cluster(staged: Staged) -> None:
-    text = "[parallel]\nclaim_ttl_s = 3600.0\n" + EVOLVE.format("a")
-    stage = staged(text)
+    stage = staged("[parallel]\nclaim_ttl_s = 3600.0\n" + EVOLVE.format("a"))
     name = stage.runs[0].name
 
     async def act(_: str) -> None:
@@ -58,12 +56,8 @@ def test_a_claim_lost_to_another_host_ends_the_run_here(staged: Staged) -> None:
         asked.append(name)
         if len(asked) == 1:
             return None
-        if len(asked) < 6:
-            return ClaimState(granted=False, holder="other:1", run="r-8")
-        return ClaimState(granted=False, holder="other:1", run="r-8", result=msgspec.to_builtins(theirs))
-
-    async def never(_: str) -> None:
-        await asyncio.Event().wait()
+        result = msgspec.to_builtins(theirs) if len(asked) >= 6 else None
+        return ClaimState(granted=False, holder="other:1", run="r-8", result=result)
 
     stage.cluster.answer, stage.act = answer, never
     index = stage.play()
@@ -138,9 +132,6 @@ def test_a_sweep_that_renews_no_claims_ends_with_the_reason(staged: Staged) -> N
         if len(asked) > 1:
             raise LookupError("a bug")
         return None
-
-    async def never(_: str) -> None:
-        await asyncio.Event().wait()
 
     stage.cluster.answer, stage.act = answer, never
     with pytest.raises(LookupError, match="a bug"):
