@@ -6,7 +6,6 @@ import os
 import re
 import socket
 import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -14,6 +13,7 @@ from commands import STILL
 from documents import APPS
 from forked import BIN, Forks
 from invented.run_dirs import write_run
+from program_runs import run_program, run_python
 
 from evopolicy_common import installation
 from evopolicy_gateway.harnesses import FORMS
@@ -54,15 +54,8 @@ getattr(importlib.import_module(module), function)()
 
 
 def without(modules: str, words: list[str], folder: Path) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-c", WITHOUT, modules, MODULES[words[0]], *words[1:]],
-        capture_output=True,
-        text=True,
-        check=False,
-        cwd=folder,
-        env=os.environ | {"XDG_STATE_HOME": str(folder / "state")},
-        timeout=120,
-    )
+    variables = os.environ | {"XDG_STATE_HOME": str(folder / "state")}
+    return run_python(WITHOUT, modules, MODULES[words[0]], *words[1:], cwd=folder, env=variables)
 
 
 @pytest.mark.parametrize("program", PROGRAMS)
@@ -75,15 +68,10 @@ def test_a_program_tells_its_version_and_how_a_line_goes_on(program: str, forked
 
 def test_completion_knows_the_commands_and_choices_of_all_rooms(forked: Forks) -> None:
     asked = {"_EVOPOLICY_COMPLETE": "complete_bash"}
-    assert forked(["evopolicy"], **asked, COMP_WORDS="evopolicy wor", COMP_CWORD="1").stdout.split() == [
-        "workers"
-    ]
-    words = forked(["evopolicy"], **asked, COMP_WORDS="evopolicy workers pa", COMP_CWORD="2").stdout.split()
-    assert words == ["pause"]
-    words = forked(
-        ["evopolicy"], **asked, COMP_WORDS="evopolicy local --tier b", COMP_CWORD="3"
-    ).stdout.split()
-    assert words == ["bwrap"]
+    lines = {"workers": "evopolicy wor", "pause": "evopolicy workers pa", "bwrap": "evopolicy local --tier b"}
+    for word, line in lines.items():
+        done = forked(["evopolicy"], **asked, COMP_WORDS=line, COMP_CWORD=str(line.count(" ")))
+        assert done.stdout.split() == [word]
 
 
 def test_a_wrong_choice_is_reported_with_the_choices(forked: Forks) -> None:
@@ -156,14 +144,8 @@ def test_a_wrong_value_is_named_with_the_remedy(
 def test_a_command_in_a_deleted_folder_says_so(tmp_path: Path) -> None:
     here = tmp_path / "here"
     here.mkdir()
-    words = ["evopolicy", "run", "--env", "toy/line", "--agent", "random"]
-    done = subprocess.run(
-        ["sh", "-c", f"cd {here} && rmdir {here} && exec {BIN / words[0]} {' '.join(words[1:])}"],
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=120,
-    )
+    command = f"{BIN / 'evopolicy'} run --env toy/line --agent random"
+    done = run_program("sh", "-c", f"cd {here} && rmdir {here} && exec {command}")
     assert done.returncode == 1
     assert done.stderr == "error: the folder in which this command was started is gone: change to another\n"
 
@@ -184,7 +166,7 @@ def interrupted() -> None:
     raise KeyboardInterrupt
 run_app(app)
 """
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
+    done = run_python(program)
     assert (done.returncode, done.stdout, done.stderr) == (130, "", "error: interrupted\n")
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import ast
 import re
 import runpy
-import subprocess
 import sys
 from collections.abc import Iterator
 from functools import cache
@@ -15,21 +14,15 @@ import msgspec
 import pytest
 import typer
 from documents import APPS, blocks_of_commands, commands, parse
+from program_runs import run_program
 
 from evopolicy_common import catalogue
 from evopolicy_coordinator.server.request_parser import REQUESTS
 
 ROOT = Path(__file__).parents[2]
 DOCUMENTS = [
-    *(
-        "README.md",
-        "ARCHITECTURE.md",
-        "SECURITY.md",
-        "CONTRIBUTING.md",
-        "THIRD_PARTY.md",
-        "deploy/README.md",
-        "examples/policies/README.md",
-    ),
+    *(f"{name}.md" for name in ("README", "ARCHITECTURE", "SECURITY", "CONTRIBUTING", "THIRD_PARTY")),
+    *("deploy/README.md", "examples/policies/README.md"),
     *(str(path.relative_to(ROOT)) for path in sorted((ROOT / "docs").rglob("*.md"))),
 ]
 FOLDERS = ("common", "coordinator", "worker", "agent_gateway", "deploy", "docs", "examples", "tests")
@@ -58,13 +51,8 @@ def code_in(document: str) -> list[str]:
 @cache
 def tree() -> frozenset[str]:
     """Paths of all files and folders that belong to the project."""
-    names = subprocess.run(
-        ["git", "ls-files", "--cached", "--others", "--exclude-standard"],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        check=False,
-    ).stdout.splitlines()
+    words = ("git", "ls-files", "--cached", "--others", "--exclude-standard")
+    names = run_program(*words, cwd=ROOT).stdout.splitlines()
     # Unpacked from an archive there is no git to ask.
     files = names or [
         str(path.relative_to(ROOT)) for folder in FOLDERS for path in (ROOT / folder).rglob("*")
@@ -203,8 +191,7 @@ def test_messages_on_the_page_about_trouble_are_in_the_code() -> None:
     ("script", "page"), [("commands", "cli"), ("options", "options"), ("files", "files")]
 )
 def test_generated_pages_are_those_of_the_code(script: str, page: str) -> None:
-    words = [sys.executable, str(ROOT / f"docs/_site/{script}.py")]
-    written = subprocess.run(words, capture_output=True, text=True, check=True).stdout
+    written = run_program(sys.executable, ROOT / f"docs/_site/{script}.py").stdout
     command = f"python docs/_site/{script}.py > docs/reference/{page}.md"
     assert text_of(f"docs/reference/{page}.md") == written, command
 

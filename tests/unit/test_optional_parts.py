@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import re
 import shutil
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
+from program_runs import run_python
 
 ROOT = Path(__file__).parents[2]
 ROOMS = ("common", "coordinator", "agent_gateway")
@@ -48,13 +47,7 @@ def test_the_rest_works_without_optional_parts(tmp_path: Path) -> None:
     for part in OPTIONAL.values():
         shutil.rmtree(tmp_path / part)
     path = ":".join(str(tmp_path / room) for room in ROOMS)
-    done = subprocess.run(
-        [sys.executable, "-c", IMPORT_ALL, path],
-        env={"PYTHONPATH": path, "PYTHONDONTWRITEBYTECODE": "1", "HOME": str(tmp_path)},
-        cwd=tmp_path,
-        capture_output=True,
-        text=True,
-        timeout=120,
-    )
+    variables = {"PYTHONPATH": path, "PYTHONDONTWRITEBYTECODE": "1", "HOME": str(tmp_path)}
+    done = run_python(IMPORT_ALL, path, env=variables, cwd=tmp_path)
     assert done.returncode == 0, done.stderr[-3000:]
     assert "Play one run on this machine" in done.stdout

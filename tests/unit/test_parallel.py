@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import re
-import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+from program_runs import run_program
 
 SUPPORT = Path(__file__).parents[1] / "support"
 CONFTEST = f"""
@@ -60,10 +60,8 @@ def test_has_the_same(process): assert process == os.getpid()
 def played(folder: Path, *options: str) -> str:
     for name, text in {"conftest.py": CONFTEST, **FILES}.items():
         (folder / name).write_text(text)
-    command = [sys.executable, "-m", "pytest", "-rA", "-p", "no:cacheprovider", *options]
-    return subprocess.run(
-        command, cwd=folder, capture_output=True, text=True, timeout=120, check=False
-    ).stdout
+    words = (sys.executable, "-m", "pytest", "-rA", "-p", "no:cacheprovider", *options)
+    return run_program(*words, cwd=folder).stdout
 
 
 def test_each_test_is_reported_once_also_those_of_a_process_that_dies(tmp_path: Path) -> None:

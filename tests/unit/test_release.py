@@ -9,6 +9,7 @@ import sys
 from pathlib import Path
 
 import yaml
+from program_runs import run_program
 
 import evopolicy_common
 
@@ -19,7 +20,7 @@ WORKFLOWS = sorted((ROOT / ".github" / "workflows").glob("*.yml"))
 def refusal(*files: Path) -> str:
     """What GitHub's schema, as it comes with check-jsonschema, finds wrong in workflow files; empty for nothing."""
     program = [sys.executable, "-m", "check_jsonschema", "--builtin-schema", "vendor.github-workflows"]
-    done = subprocess.run([*program, *map(str, files)], capture_output=True, text=True, check=False)
+    done = run_program(*program, *files)
     return "" if done.returncode == 0 else done.stdout + done.stderr
 
 

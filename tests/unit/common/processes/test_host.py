@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import shutil
-import subprocess
 from pathlib import Path
 
 import pytest
+from program_runs import run_program
 
 from evopolicy_common.processes import proc
 
@@ -19,9 +19,7 @@ def test_boot_id_is_the_same_in_namespaces_of_their_own() -> None:
     if shutil.which("bwrap") is None:
         pytest.skip("bubblewrap is missing: bash deploy/setup-host.sh")
     inside = ["bwrap", "--unshare-all", "--ro-bind", "/", "/", "--proc", "/proc"]
-    read = subprocess.run(
-        [*inside, "cat", "/proc/sys/kernel/random/boot_id"], capture_output=True, text=True, check=True
-    )
+    read = run_program(*inside, "cat", "/proc/sys/kernel/random/boot_id")
     assert read.stdout.strip() == proc.boot_id()
 
 

@@ -123,24 +123,20 @@ async def test_what_a_killed_command_left_in_the_state_folder_is_removed(
     assert list(tmp_path.glob("*.json")) == [others]
 
 
-def test_a_worker_holds_its_lock_until_its_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_a_worker_holds_its_lock_until_its_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     programs(monkeypatch, SERVES)
     workers = tmp_path / "workers"
-
-    async def main() -> None:
-        async with local_cluster.local_cluster("test", state=tmp_path) as cluster:
-            await cluster.start_workers(["toy/line"], slots=1)
-            (lock,) = workers.iterdir()
-            assert lock.read_text() == str(os.getpid())
-            starting: Any = cluster._start_workers
-            processes, *_ = starting.args
-            holders = [child for child in processes._running if lock in open_files(child.pid)]
-            assert [child.log.stem for child in holders] == ["test-worker"]
-            assert lock not in open_files(os.getpid())
-            assert open_run.is_held(lock)
-
-    asyncio.run(main())
-    (lock,) = workers.iterdir()
+    async with local_cluster.local_cluster("test", state=tmp_path) as cluster:
+        await cluster.start_workers(["toy/line"], slots=1)
+        (lock,) = workers.iterdir()
+        assert lock.read_text() == str(os.getpid())
+        starting: Any = cluster._start_workers
+        processes, *_ = starting.args
+        holders = [child for child in processes._running if lock in open_files(child.pid)]
+        assert [child.log.stem for child in holders] == ["test-worker"]
+        assert lock not in open_files(os.getpid())
+        assert open_run.is_held(lock)
+    assert list(workers.iterdir()) == [lock]
     assert not open_run.is_held(lock)
 
 

@@ -8,6 +8,7 @@ import sys
 import time
 
 from machines.own_processes import alive
+from program_runs import run_program
 
 from evopolicy_common.processes import parent_death
 
@@ -36,13 +37,11 @@ time.sleep(1000)
 
 
 def test_a_program_whose_parent_is_gone_does_not_start() -> None:
-    words = [sys.executable, parent_death.__file__, "1", "9", "", "/bin/echo", "started"]
-    done = subprocess.run(words, capture_output=True, check=False)
-    assert (done.returncode, done.stdout) == (1, b"")
+    done = run_program(sys.executable, parent_death.__file__, "1", "9", "", "/bin/echo", "started")
+    assert (done.returncode, done.stdout) == (1, "")
 
 
 def test_a_program_that_is_not_there_is_reported_in_one_line() -> None:
-    words = parent_death.ending_with_parent(["/no/such/program"])
-    done = subprocess.run(words, capture_output=True, text=True, check=False)
+    done = run_program(*parent_death.ending_with_parent(["/no/such/program"]))
     assert done.returncode == 127
     assert done.stderr == "cannot start /no/such/program: No such file or directory\n"

@@ -13,11 +13,7 @@ from pathlib import Path
 import pytest
 
 from evopolicy_common.errors import BundleError, ProtocolError
-from evopolicy_common.records.code_metrics import (
-    MAX_PARSED_BYTES,
-    code_metrics,
-    parse,
-)
+from evopolicy_common.records.code_metrics import MAX_PARSED_BYTES, code_metrics, parse
 from evopolicy_common.records.policies import checkpoints
 from evopolicy_common.records.policies.bundles import MAX_FILES, BundleFile, pack
 from evopolicy_common.records.policies.checkpoints import CheckpointMeta, measured
@@ -50,12 +46,8 @@ def test_a_bundle_returns_from_its_checkpoint_with_metadatas_names(tmp_path: Pat
     assert not (folder / "policy.py").stat().st_mode & 0o222
     assert (folder / "run.sh").stat().st_mode & 0o100
     system = checkpoints.without_metadata(bundle.files)
-    assert [file.path for file in system.files] == [
-        "deep/metrics.json",
-        "policy.py",
-        "run.sh",
-        "system/policy.py",
-    ]
+    kept = ["deep/metrics.json", "policy.py", "run.sh", "system/policy.py"]
+    assert [file.path for file in system.files] == kept
 
 
 def test_a_bundle_of_as_many_files_as_there_may_be_comes_back(tmp_path: Path) -> None:

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import struct
-import subprocess
-import sys
 from typing import Any
 
 import msgspec
@@ -13,14 +11,14 @@ import pytest
 import zstandard
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from program_runs import run_python
 
 from evopolicy_common.errors import ProtocolError
 from evopolicy_common.records.episodes import columns, trajectory
 
 HEADER = {"record": "full", "observations": "arrays"}
 ROW: dict[str, Any] = {
-    "obs": ["values", [None]],
-    "actions": ["values", [None]],
+    **{name: ["values", [None]] for name in ("obs", "actions")},
     "rewards": bytes(8),
     "flags": bytes(1),
     "infos": 1,
@@ -118,8 +116,7 @@ def verdicts(tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[int, s
         data = framed(*made())
         assert len(data) < 200_000
         (folder / str(number)).write_bytes(data)
-    files = [str(folder / str(number)) for number in range(len(HOSTILE))]
-    ran = subprocess.run([sys.executable, "-c", DECODES, *files], capture_output=True, text=True, timeout=570)
+    ran = run_python(DECODES, *(folder / str(number) for number in range(len(HOSTILE))), timeout=570)
     assert ran.stderr == ""
     lines = [line.split() for line in ran.stdout.splitlines()]
     return {number: (int(grown), verdict) for number, grown, verdict in lines}

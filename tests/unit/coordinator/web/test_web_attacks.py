@@ -56,6 +56,7 @@ from evopolicy_coordinator.web.content.run_folders import key_of
 
 SCORE, RANDOM = "4242", "-4322"
 MARKUP = '<script>alert(1)</script><img src=x onerror="alert(2)">'
+UNESCAPED = ("<script>alert", "<img src=x", "<svg onload", "<b>x</b>", "Agent <script>", "<code><script>")
 PAGES = ("/", "/run/{key}", "/run/{key}/submit/0", "/run/{key}/submit/0/episode/0")
 
 
@@ -68,10 +69,7 @@ def key(folder: Path) -> str:
 
 @pytest.mark.parametrize(
     "path",
-    [
-        *("/", "/cluster", "/run/x", "/run/x/file?path=a"),
-        *("/report/index.html", "/metrics"),
-    ],
+    ["/", "/cluster", "/run/x", "/run/x/file?path=a", "/report/index.html", "/metrics"],
 )
 def test_nothing_is_disclosed_without_a_token_on_loopback_either(tmp_path: Path, path: str) -> None:
     with client(site_of(tmp_path), signed_in=False) as stranger:
@@ -93,9 +91,8 @@ def test_only_the_right_token_gets_a_strict_cookie(tmp_path: Path) -> None:
     with client(site_of(tmp_path), signed_in=False) as stranger:
         wrong = stranger.post("/login", content="token=no", headers={"origin": ORIGIN})
         assert (wrong.status_code, wrong.headers.get("set-cookie")) == (401, None)
-        cookie = stranger.post("/login", content=f"token={TOKEN}", headers={"origin": ORIGIN}).headers[
-            "set-cookie"
-        ]
+        right = stranger.post("/login", content=f"token={TOKEN}", headers={"origin": ORIGIN})
+        cookie = right.headers["set-cookie"]
         assert "httponly" in cookie.lower()
         assert "samesite=strict" in cookie.lower()
         assert TOKEN not in cookie
@@ -273,15 +270,10 @@ def test_what_agents_wrote_is_text_on_every_page(tmp_path: Path) -> None:
         {"type": "assistant", "message": {"content": [{"type": "text", "text": MARKUP}, {"type": "tool_use", "name": MARKUP, "input": {MARKUP: MARKUP}}]}},  # noqa: E501
         {"type": "stderr", "text": MARKUP},
     ]  # fmt: skip
-    folder = open_run(
-        tmp_path,
-        entry="Agent <script>",
-        files={"policy.py": MARKUP.encode(), "<img src=x>.svg": b"<svg onload=alert(3)>"},
-        log=texts,
-    )
-    (folder / "logs" / "harness.log").write_text(
-        '{"event": "<script>alert(4)</script>", "why": "<b>x</b>"}\n'
-    )
+    files = {"policy.py": MARKUP.encode(), "<img src=x>.svg": b"<svg onload=alert(3)>"}
+    folder = open_run(tmp_path, entry="Agent <script>", files=files, log=texts)
+    event = '{"event": "<script>alert(4)</script>", "why": "<b>x</b>"}\n'
+    (folder / "logs" / "harness.log").write_text(event)
     episode = folder / "workspace/feedback/submit_000/episodes/ep_000"
     (episode / "stdout.txt").write_text(MARKUP)
     (episode / "error.txt").write_text(MARKUP)
@@ -289,24 +281,13 @@ def test_what_agents_wrote_is_text_on_every_page(tmp_path: Path) -> None:
         worker=MARKUP, host=MARKUP, slots=1, state="active", tiers=("bwrap",), environments=(MARKUP,), fingerprint=MARKUP,  # noqa: E501
         versions={MARKUP: MARKUP}, held=0, running=0, last_seen_s=0.0, refused={MARKUP: MARKUP}, hidden_bar=MARKUP, missing_tiers={MARKUP: MARKUP}, playing={MARKUP: 1},  # noqa: E501
     )  # fmt: skip
-    reply = status(
-        open_status("r-open", entry=MARKUP, waits_for=MARKUP, exp_id=MARKUP),
-        workers=(worker,),
-        stalls=(MARKUP,),
-    )
+    run = open_status("r-open", entry=MARKUP, waits_for=MARKUP, exp_id=MARKUP)
+    reply = status(run, workers=(worker,), stalls=(MARKUP,))
     with client(site_of(tmp_path, cluster=reply)) as operator:
         for path in (*PAGES, "/cluster", "/?q=" + "%3Cscript%3E"):
             answer = operator.get(path.format(key=key(folder)))
             assert answer.status_code == 200, path
-            pieces = (
-                "<script>alert",
-                "<img src=x",
-                "<svg onload",
-                "<b>x</b>",
-                "Agent <script>",
-                "<code><script>",
-            )
-            assert [piece for piece in pieces if piece in answer.text] == [], path
+            assert [piece for piece in UNESCAPED if piece in answer.text] == [], path
             assert "&lt;" in answer.text, path
 
 
@@ -320,9 +301,11 @@ def test_no_page_has_inline_script_or_style_and_the_policy_forbids_them(tmp_path
             assert answer.headers["x-content-type-options"] == "nosniff"
             assert all("src=" in tag for tag in answer.text.split("<script")[1:])
             text = answer.text.replace("http://www.w3.org/2000/svg", "")
-            assert [
-                each for each in ("<style", ' style="', " onclick", "http://", "https://") if each in text
-            ] == []
+            inline = ("<style", ' style="', " onclick", "http://", "https://")
+            assert [each for each in inline if each in text] == []
+
+
+SVG = "<svg xmlns='http://www.w3.org/2000/svg'><script>alert(1)</script></svg>"
 
 
 def test_an_svg_or_html_of_an_agent_is_served_as_sandboxed_text(tmp_path: Path) -> None:
@@ -331,9 +314,7 @@ def test_an_svg_or_html_of_an_agent_is_served_as_sandboxed_text(tmp_path: Path) 
     with client(site_of(tmp_path)) as reader:
         reader.get("/")
         for name in ("a.svg", "a.html", "a.xml", "a.js"):
-            (episode / name).write_text(
-                "<svg xmlns='http://www.w3.org/2000/svg'><script>alert(1)</script></svg>"
-            )
+            (episode / name).write_text(SVG)
             path = f"workspace/feedback/submit_000/episodes/ep_000/{name}"
             answer = reader.get(f"/run/{key(folder)}/file", params={"path": path})
             assert answer.headers["content-type"].startswith("text/plain")
@@ -419,10 +400,7 @@ def shows(folder: Path, *runs: RunStatus, roots: Path | None = None, cluster: bo
 
 def seen(site: Site, folder: Path) -> bool:
     with client(site) as reader:
-        texts = [
-            reader.get(path.format(key=key(folder))).text
-            for path in ("/", "/run/{key}", "/run/{key}/submit/0", "/cluster")
-        ]
+        texts = [reader.get(path.format(key=key(folder))).text for path in (*PAGES[:3], "/cluster")]
     # Digests and tokens, which differ from run to run, may contain the same digits.
     numbers = re.compile(rf"(?<![\w-])({SCORE}|{RANDOM})(?!\w)")
     return any(numbers.search(text) for text in texts)

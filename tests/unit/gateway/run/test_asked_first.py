@@ -40,12 +40,9 @@ def ask(folder: Path, operations: Operations, budget: int = 8) -> str:
     plan.folder.root.mkdir(parents=True, exist_ok=True)
     (plan.folder.run_json).write_text("earlier")
 
-    async def main() -> str:
-        nothing: Any = object()
-        lifecycle = RunLifecycle(plan, operations, nothing, nothing)  # type: ignore[arg-type]
-        return (await lifecycle._ask(CreateRun(key=uuid.uuid4().hex, settings=settings))).key
-
-    key = asyncio.run(main())
+    nothing: Any = object()
+    lifecycle = RunLifecycle(plan, operations, nothing, nothing)  # type: ignore[arg-type]
+    key = asyncio.run(lifecycle._ask(CreateRun(key=uuid.uuid4().hex, settings=settings))).key
     assert plan.folder.run_json.read_text() == "earlier"
     return key
 

@@ -114,7 +114,7 @@ def test_an_archive_of_very_many_arrays_is_refused_before_they_are_listed() -> N
     assert peak_of(work)[1] < 24 << 20
 
 
-def test_large_episodes_are_written_one_by_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_large_episodes_are_written_one_by_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     at_work, most, lock = 0, 0, threading.Lock()
     real = feedback.episode_files
 
@@ -129,12 +129,8 @@ def test_large_episodes_are_written_one_by_one(tmp_path: Path, monkeypatch: pyte
         return real(*args, **more)
 
     monkeypatch.setattr(feedback, "episode_files", slow)
-
-    async def main() -> None:
-        async with served(tmp_path) as s:
-            # Their recordings are not rendered, so nothing is known of their size; those of even cases come as blobs.
-            answer = await s.submit([0, 2, 4, 6])
-            assert answer.json()["status"] == "ok"
-
-    asyncio.run(main())
+    async with served(tmp_path) as s:
+        # Their recordings are not rendered, so nothing is known of their size; those of even cases come as blobs.
+        answer = await s.submit([0, 2, 4, 6])
+        assert answer.json()["status"] == "ok"
     assert most == 1

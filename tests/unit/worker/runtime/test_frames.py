@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import struct
 from typing import Any
 
@@ -75,14 +76,9 @@ def test_an_observation_of_another_shape_is_the_environments_fault(obs: Any) -> 
 @settings(max_examples=400)
 @given(st.integers(0, 255), st.binary(max_size=80))
 def test_hostile_replies_are_an_action_or_refused_and_nothing_else(tag: int, payload: bytes) -> None:
-    try:
-        frames.action(tag, payload)
-    except frames.BadReplyError:
-        pass
-    try:
-        frames.report(payload)
-    except frames.BadReplyError:
-        pass
+    for read in (lambda: frames.action(tag, payload), lambda: frames.report(payload)):
+        with contextlib.suppress(frames.BadReplyError):
+            read()
 
 
 @pytest.mark.parametrize(
@@ -146,15 +142,8 @@ def test_an_action_that_cannot_be_sent_is_reported() -> None:
     endless: list[Any] = []
     endless.append(endless)
     for action in (
-        *(
-            endless,
-            1 << 5000,
-            np.zeros(1 << 20),
-            ["x" * (1 << 20)] * 3,
-            [1.0] * 4000,
-            [1.0] * 1025,
-            [[]] * 2000,
-        ),
+        *(endless, 1 << 5000, np.zeros(1 << 20), ["x" * (1 << 20)] * 3),
+        *([1.0] * 4000, [1.0] * 1025, [[]] * 2000),
         *(np.empty((2**32 - 1, 0)), [np.empty((2**32 - 1, 0))], np.empty((2**40, 0)), np.zeros((1,) * 17)),
         *(np.zeros(1025, np.float16), [np.zeros(600, np.bool_)] * 2, {"a": np.empty((1025, 0))}),
     ):

@@ -117,9 +117,8 @@ def test_no_wall_limit_counts_time_without_a_processor(slots: Slots) -> None:
         return await asyncio.wait_for(task, 100)
 
     with starved() as group:
-        hog = subprocess.Popen(
-            [sys.executable, "-c", "import os; os.sched_setaffinity(0, {0})\nwhile True: pass"]
-        )
+        busy = "import os; os.sched_setaffinity(0, {0})\nwhile True: pass"
+        hog = subprocess.Popen([sys.executable, "-c", busy])
         try:
             (outcome,) = slots.run(work())
         finally:
