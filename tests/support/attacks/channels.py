@@ -19,24 +19,16 @@ import time
 from pathlib import Path
 from typing import Any
 
+import msgspec
 from slots import QUICK, Slots, make_job
 
-from evopolicy_common.messages.episode import ResourceLimits
 from evopolicy_gateway.jail.installs import needs_of
 from evopolicy_gateway.jail.jail import Way
 from evopolicy_gateway.jail.view import View
 from evopolicy_worker.slots.slot import Slot
 
 PERIOD_S = 0.05
-LIMITS = ResourceLimits(
-    episode_wall_s=300.0,
-    act_wall_s=250.0,
-    init_wall_s=60.0,
-    cpu_s=280.0,
-    memory_bytes=QUICK.memory_bytes,
-    processes=QUICK.processes,
-    file_bytes=QUICK.file_bytes,
-)
+LIMITS = msgspec.structs.replace(QUICK, episode_wall_s=300.0, act_wall_s=250.0, init_wall_s=60.0, cpu_s=280.0)
 
 WAYS = {
     "writes files": ("shmem", "shared_ram", "free_ram"),

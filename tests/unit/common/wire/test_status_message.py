@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import msgspec
+from invented import web_site
 
 from evopolicy_common.messages.status import StatusReply, WorkerStatus, folded, unfolded
 from evopolicy_common.wire import codec
@@ -34,15 +35,7 @@ def worker(index: int) -> WorkerStatus:
 
 
 def test_the_status_of_ten_thousand_workers_arrives_whole() -> None:
-    status = StatusReply(
-        cluster="c",
-        version="1",
-        uptime_s=1.0,
-        episodes_done=1,
-        episodes_per_s=1.0,
-        workers=tuple(map(worker, range(10_000))),
-        runs=(),
-    )
+    status = web_site.status(workers=tuple(map(worker, range(10_000))))
     assert len(msgspec.msgpack.encode(status)) > codec.MAX_MESSAGE_BYTES
     sent = codec.encode(folded(status))
     arrived = codec.decode(codec.operator_replies, sent)
