@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import uuid
 from pathlib import Path
 from typing import Any
@@ -33,33 +32,32 @@ class Operations:
         del self.open[run]
 
 
-def ask(folder: Path, operations: Operations, budget: int = 8) -> str:
+async def ask(folder: Path, operations: Operations, budget: int = 8) -> str:
     """The key of the run that a command opens before it is killed."""
     settings = RunSettings(env="toy/line", entry="a", model="a", exp_id="t", budget=budget)
     plan = plan_in(folder, settings, overwrite=True)
     plan.folder.root.mkdir(parents=True, exist_ok=True)
     (plan.folder.run_json).write_text("earlier")
-
     nothing: Any = object()
     lifecycle = RunLifecycle(plan, operations, nothing, nothing)  # type: ignore[arg-type]
-    key = asyncio.run(lifecycle._ask(CreateRun(key=uuid.uuid4().hex, settings=settings))).key
+    key = (await lifecycle._ask(CreateRun(key=uuid.uuid4().hex, settings=settings))).key
     assert plan.folder.run_json.read_text() == "earlier"
     return key
 
 
-def test_a_command_killed_after_it_asked_finds_its_run_again(tmp_path: Path) -> None:
+async def test_a_command_killed_after_it_asked_finds_its_run_again(tmp_path: Path) -> None:
     operations = Operations()
-    first = ask(tmp_path, operations)
-    assert ask(tmp_path, operations) == first
-    other = ask(tmp_path, operations, budget=4)
+    first = await ask(tmp_path, operations)
+    assert await ask(tmp_path, operations) == first
+    other = await ask(tmp_path, operations, budget=4)
     assert [*operations.open] == [other]
     assert other != first
 
 
-def test_a_refused_run_leaves_no_request_and_the_earlier_run(tmp_path: Path) -> None:
+async def test_a_refused_run_leaves_no_request_and_the_earlier_run(tmp_path: Path) -> None:
     operations = Operations()
     operations.refuses = True
     with pytest.raises(ConfigError, match="are public"):
-        ask(tmp_path, operations)
+        await ask(tmp_path, operations)
     files = [path.name for path in tmp_path.rglob("*") if path.is_file()]
     assert files == ["run.json"]
