@@ -79,6 +79,7 @@ class Progress(Event, frozen=True, kw_only=True, tag="progress"):
     spent: bool = False
     """No further submit is possible, and none runs."""
     cancelled: bool = False
+    """The operator has cancelled the run."""
 
 
 class AgentTurn(Event, frozen=True, kw_only=True, tag="turn"):
@@ -171,6 +172,7 @@ class StartAgent(Order, frozen=True, kw_only=True, tag="start_agent"):
     silence_s: float | None = None
     """A program without activity for this long is ended, seconds; None: no such limit."""
     jail: JailOrder | None = None
+    """None: not jailed."""
     limits: AgentLimits = AgentLimits()
 
 

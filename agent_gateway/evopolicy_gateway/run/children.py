@@ -83,6 +83,7 @@ class GatewayProcess(Kept):
         super().__init__(run)
         self._on_progress = on_progress
         self.closed = False
+        """Whether the coordinator has closed the run."""
         self._close: messages.CloseRun | None = None
 
     @property

@@ -131,6 +131,7 @@ class TicketMachine:
         """The state known to this gateway; `hear` updates it."""
         self.closed = run.state.is_finalized
         self.cancelled = run.state.cancelled
+        """The operator has cancelled the run."""
         self.in_flight: Ticket | None = None
         self.tickets: list[Ticket] = []
         """Accepted submits by index, followed by at most one that is not accepted yet."""

@@ -62,6 +62,7 @@ class Exit(msgspec.Struct, frozen=True, kw_only=True):
     """A waitpid status."""
     cpu_s: float
     peak_bytes: int = 0
+    """Peak resident memory."""
 
     def describe(self) -> str:
         if os.WIFSIGNALED(self.status):

@@ -28,6 +28,7 @@ class MiniWoBFamily(GymnasiumFamily):
     measures = True
     prefix, suffix = "miniwob/", "-v1"
     environment = "miniwob_env:MiniWoBEnv"
+    """Module and class of its environments."""
 
     def installed(self) -> bool:
         return super().installed() and not chromium.lacking()
