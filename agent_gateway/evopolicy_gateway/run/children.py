@@ -11,7 +11,7 @@ from pathlib import Path
 
 import msgspec
 
-from evopolicy_common.errors import EvopolicyError
+from evopolicy_common.errors import EvopolicyError, StorageError
 from evopolicy_common.processes import child_process, proc
 from evopolicy_common.records.blobs import write_atomically
 from evopolicy_common.records.run_record import AgentLimits
@@ -239,7 +239,7 @@ class SupervisedAgent(Kept):
         if terms is not None and run.folder.model_requests.exists():
             used = read_ledger(run.folder.model_requests).usage.total
             left["model_tokens"] = max(0, terms.limits.max_tokens - used)
-        with contextlib.suppress(OSError):
+        with contextlib.suppress(StorageError):
             write_atomically(run.folder.left, msgspec.json.encode(left))
 
     def _start_order(self, ready: Ready, relay: RelayAddress | None) -> messages.StartAgent:

@@ -5,11 +5,12 @@ It is written after every change, to a private file outside the workspace.
 
 from __future__ import annotations
 
+import contextlib
 from pathlib import Path
 
 import msgspec
 
-from evopolicy_common.errors import DECODE_ERRORS
+from evopolicy_common.errors import DECODE_ERRORS, StorageError
 from evopolicy_common.records.blobs import write_atomically
 from evopolicy_gateway.relay.usage import Usage
 
@@ -59,9 +60,6 @@ def load(path: Path | None) -> SessionState:
 
 def save(path: Path | None, state: SessionState) -> None:
     """Saves the state. If the disk refuses it is lost, and the agent continues."""
-    if path is None:
-        return
-    try:
-        write_atomically(path, msgspec.json.encode(state), mode=0o600)
-    except OSError:
-        return
+    if path is not None:
+        with contextlib.suppress(StorageError):
+            write_atomically(path, msgspec.json.encode(state), mode=0o600)
