@@ -1,4 +1,4 @@
-"""A full disk costs what helps an agent, never the agent or its run. A folder that is gone refuses as a full disk does."""
+"""A full disk costs what helps an agent, never the agent or its run. A folder that is gone refuses as a full disk."""
 
 from __future__ import annotations
 
