@@ -14,7 +14,7 @@
 # make bench  what an episode costs, beside a bare loop
 # make bench-start        what one waits for before anything is played
 # make bench-peers        the same episodes through Gymnasium's vectors, Ray and Dask, where they are installed
-# make bench-against      small submits of another revision and of the files here, in turns; ARGS="--revision REV"
+# make bench-against      submits of another revision and of the files here, in turns; ARGS="--revision REV", or --slots
 # make bench-throughput   episodes per second through the coordinator
 # make bench-scale        CPU of coordinator, gateways and workers' supervisors an episode, with real trajectories
 # make bench-channels     what a policy can tell others on its machine, at once and afterwards; --gaps N: what time tells it of its split
@@ -140,9 +140,9 @@ bench-start: install
 bench-peers: install
 	@PYTHONPATH=tests/bench:tests/support $(BIN)/python tests/bench/peers_bench.py $(ARGS)
 
-# Not slower than the revision in tests/bench/revision.txt? Another: make bench-against ARGS="--revision REV --rounds 5"
+# Not slower than the revision in tests/bench/revision.txt? Another, or to a hundredth: make bench-against ARGS="--revision REV --slots --rounds 8"
 bench-against: install
-	@PYTHONPATH=tests/bench $(BIN)/python tests/bench/against_bench.py $(ARGS)
+	@PYTHONPATH=tests/bench:tests/support $(BIN)/python tests/bench/against_bench.py $(ARGS)
 
 # Episodes per second through coordinator and Zenoh.
 bench-throughput: install

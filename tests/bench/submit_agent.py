@@ -1,6 +1,7 @@
 """The bench's agent: a warm-up, then one submit of N episodes; writes how long it took.
 
-`python submit_agent.py N RESULT`, or with `--small`: a submit of N episodes, then the same a few times more.
+`python submit_agent.py N RESULT`, or with `--small`: a submit of N episodes, then the same a few times more. With a
+pipe in place of `--small`: a submit for each empty line that comes from it, whose seconds go to RESULT as a line.
 """
 
 from __future__ import annotations
@@ -34,6 +35,11 @@ SMALL = 4
 
 def main(n: int, result: Path, *how: str) -> None:
     (Path("system") / "policy.py").write_text(POLICY)
+    if how and how[0] != "--small":
+        with open(how[0]) as orders, result.open("w", buffering=1) as answers:
+            while orders.readline() == "\n":
+                print(submit(list(range(n))), file=answers)
+        return
     if how:
         small_s = [submit(list(range(n))) for _ in range(SMALL)]
         result.write_text(json.dumps({"small_s": small_s[1:]}))
