@@ -164,9 +164,16 @@ class Command:
         wait_until(lambda: not self.alive())
 
     def kill_all(self) -> None:
-        for pid in self.alive():
-            with contextlib.suppress(ProcessLookupError):
-                os.kill(pid, signal.SIGKILL)
+        """Sends SIGKILL to the command and all that it started, and waits until nothing of it lives."""
+
+        def are_gone() -> bool:
+            pids = self.alive()
+            for pid in pids:
+                with contextlib.suppress(ProcessLookupError):
+                    os.kill(pid, signal.SIGKILL)
+            return not pids
+
+        wait_until(are_gone)
         self.process.wait()
 
 

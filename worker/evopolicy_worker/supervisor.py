@@ -544,7 +544,7 @@ class BundleCache:
                 raise
             yield folder
         finally:
-            self._users -= Counter((digest,))
+            self._users[digest] -= 1
             await self._evict()
 
     async def _bring(self, digest: str) -> Path:
@@ -559,6 +559,6 @@ class BundleCache:
             if len(self._ready) <= self._limit:
                 return
             task = self._ready[digest]
-            if digest not in self._users and task.done():
-                del self._ready[digest]
+            if not self._users[digest] and task.done():
+                del self._ready[digest], self._users[digest]
                 await asyncio.to_thread(shutil.rmtree, self._root / digest, ignore_errors=True)

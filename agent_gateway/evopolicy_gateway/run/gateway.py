@@ -38,6 +38,8 @@ from evopolicy_gateway.workspace import staging as workspace
 from evopolicy_gateway.workspace.agents_md import Urls
 
 _POLL_S = 1.0
+_REPORT_S = 0.1
+"""Pause after a report of changes: a submit changes ten times, and each report wakes three processes."""
 
 
 class Gateway:
@@ -120,20 +122,22 @@ class Gateway:
 
     async def _watch(self, pipeline: SubmitPipeline, http: asyncio.Task[None]) -> CloseRun | None:
         """Reports changes until `tell`; returns its argument."""
+        ends: list[asyncio.Future[Any]] = [self._orders, pipeline.fatal, http]
         self._changed.set()
         while True:
             changed = asyncio.ensure_future(self._changed.wait())
-            waited: list[asyncio.Future[Any]] = [changed, self._orders, pipeline.fatal, http]
-            await asyncio.wait(waited, return_when=asyncio.FIRST_COMPLETED)
+            await asyncio.wait([changed, *ends], return_when=asyncio.FIRST_COMPLETED)
             changed.cancel()
             for ended in (pipeline.fatal, http):
                 if ended.done():
                     ended.result()
                     raise ConfigError("the HTTP service ended unexpectedly")
+            if self._changed.is_set():
+                self._changed.clear()
+                self._on_change(pipeline)
             if self._orders.done():
                 return self._orders.result()
-            self._changed.clear()
-            self._on_change(pipeline)
+            await asyncio.wait(ends, timeout=_REPORT_S, return_when=asyncio.FIRST_COMPLETED)
 
     async def _close(self, pipeline: SubmitPipeline, close: CloseRun) -> bool:
         await asyncio.to_thread(save, self._folder.closing, close)

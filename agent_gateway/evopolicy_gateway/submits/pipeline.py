@@ -172,15 +172,7 @@ class SubmitPipeline:
         try:
             match effect:
                 case TakeSnapshot():
-                    given = self.folder.system, self._blobs
-                    published = machine.run.profile != "own"
-                    snapshot = await self._on_disk(
-                        partial(snapshots.take_snapshot, *given, published=published)
-                    )
-                    more = (ticket.submit_id, self._trees, self._blobs, self.folder.root)
-                    return machine.snapshotted(
-                        await asyncio.to_thread(snapshots.record_tree, snapshot, *more)
-                    )
+                    return machine.snapshotted(await self._on_disk(partial(self._snapshot, ticket.submit_id)))
                 case Send():
                     return machine.sent(await self._send(ticket.request.submit, ticket.index))
                 case Collect():
@@ -204,6 +196,11 @@ class SubmitPipeline:
         except Exception as error:
             log.error("submit failed", submit=ticket.submit_id, exc_info=error)
             return machine.failed(error)
+
+    def _snapshot(self, submit: str) -> snapshots.Snapshot:
+        published = self.machine.run.profile != "own"
+        snapshot = snapshots.take_snapshot(self.folder.system, self._blobs, published=published)
+        return snapshots.record_tree(snapshot, submit, self._trees, self.folder.root)
 
     async def _note(self, entry: AnyLine) -> int:
         """Appends to the journal, in order; returns the offset."""

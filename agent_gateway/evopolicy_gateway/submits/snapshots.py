@@ -27,6 +27,8 @@ class Snapshot(msgspec.Struct, frozen=True, kw_only=True):
     error: PolicyFailure | None
     kept: str | None = None
     """Digest of a bundle without a policy: stored for the run's checkpoint, and not sent."""
+    bundle: bundles.Bundle | None = None
+    """None where `system/` cannot be one."""
     tree: str = ""
     """Digest of the workspace's tree; empty: not recorded."""
 
@@ -51,17 +53,14 @@ def take_snapshot(system: Path, blobs: BlobStore, *, published: bool = False) ->
     elif published:
         failure = _fault_of_source(files)
     digest = blobs.put(bundle.packed)
-    return Snapshot(digest=None if failure else digest, error=failure, kept=digest if failure else None)
+    sent, kept = (None, digest) if failure else (digest, None)
+    return Snapshot(digest=sent, error=failure, kept=kept, bundle=bundle)
 
 
-def record_tree(
-    snapshot: Snapshot, submit: str, recorder: Recorder, blobs: BlobStore, folder: Path
-) -> Snapshot:
+def record_tree(snapshot: Snapshot, submit: str, recorder: Recorder, folder: Path) -> Snapshot:
     """The snapshot with the workspace's tree, unless that cannot be recorded. `folder`: the run's."""
-    digest = snapshot.digest or snapshot.kept
     try:
-        bundle = None if digest is None else bundles.load(blobs.read_blob(digest), digest)
-        tree = recorder.record(submit, bundle, read_passed(folder))
+        tree = recorder.record(submit, snapshot.bundle, read_passed(folder))
     except Exception as error:
         log.error("the workspace is not recorded", submit=submit, exc_info=error)
         return snapshot
