@@ -279,8 +279,7 @@ def trial_of(
     env = one_environment(env)
     folder = given["policy"]
     bundle = policy_of(folder) if callable(folder) else policy_bundle(shipped.found(folder, Path.cwd()))
-    known = {"sandbox_tier": tier, "limits": given["limits"] or ResourceLimits()}
-    return bundle, evaluation(env, bundle.digest, "train", given["cases"], **known)
+    return bundle, evaluation(env, bundle, given["cases"], tier, given["limits"] or ResourceLimits())
 
 
 def plan_of(
@@ -294,7 +293,7 @@ def plan_of(
         agent=agent, **{name: value for name, value in taken(**options).items() if value is not None}
     )
     jail = JailSettings() if listener is None else JailSettings(mode="none")
-    (plan,) = given.plans([env], Path.cwd(), agent_host, jail=jail, listener=listener)
+    (plan,) = given.plans([env], jail, agent_host, listener)
     return plan
 
 

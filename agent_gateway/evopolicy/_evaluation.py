@@ -93,8 +93,7 @@ class Evaluation(Sequence[Episode]):
     @property
     def records(self) -> Records[EvaluationRecord]:
         """The episodes without their trajectories."""
-        names = EvaluationRecord.__struct_fields__
-        made = [EvaluationRecord(**{name: getattr(one, name) for name in names}) for one in self.episodes]
+        made = [msgspec.convert(one, EvaluationRecord, from_attributes=True) for one in self.episodes]
         return Records(EvaluationRecord, made)
 
     def to_pandas(self) -> Any:

@@ -6,6 +6,7 @@ import base64
 import html
 import os
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -60,13 +61,13 @@ class EpisodeRecord(msgspec.Struct, frozen=True, kw_only=True):
     """Index of the submit; for a held-out episode, of the selected submit."""
     episode: int
     """Index within the submit, or within the held-out episodes, from 0."""
-    case: int | None
+    case: int | None = None
     """Train id; None for held-out episodes, whose cases have no ids."""
     episode_return: float
     """Sum of rewards."""
-    length: int | None
+    length: int | None = None
     """Steps; None for held-out episodes."""
-    failed: bool | None
+    failed: bool | None = None
     """Whether the policy failed; None for held-out episodes."""
 
 
@@ -119,12 +120,17 @@ class Run:
     def submits(self) -> Records[SubmitRecord]:
         """In the order of their indices."""
         outcome = self._record.outcome
-        same = ("status", "n_episodes", "mean_return", "std_return", "remaining_budget")
+        made = partial(
+            SubmitRecord, run=str(self.folder), env=self._record.env, entry=self._record.agent.entry
+        )
         rows = [
-            SubmitRecord(
-                **self._known,
-                **{name: getattr(one, name) for name in same},
+            made(
                 submit=one.submit_index,
+                status=one.status,
+                n_episodes=one.n_episodes,
+                mean_return=one.mean_return,
+                std_return=one.std_return,
+                remaining_budget=one.remaining_budget,
                 validation=(outcome.val_scores or {}).get(str(one.submit_index)),
                 selected=one.submit_index == outcome.best_submit_index,
             )
@@ -133,26 +139,28 @@ class Run:
         return Records(SubmitRecord, rows)
 
     @property
-    def _known(self) -> dict[str, Any]:
-        return {"run": str(self.folder), "env": self._record.env, "entry": self._record.agent.entry}
-
-    @property
     def episodes(self) -> Records[EpisodeRecord]:
         """Train episodes of ok submits, then the held-out episodes."""
+        record, outcome = self._record, self._record.outcome
+        made = partial(EpisodeRecord, run=str(self.folder), env=record.env, entry=record.agent.entry)
         rows = []
         for one in self._summaries:
-            known = self._known | {"split": "train", "submit": one.submit_index}
             cases, lengths, failed = one.env_instances or (), one.episode_lengths or (), set(one.errors or ())
             for index, value in enumerate(one.returns or ()):
-                known |= {"case": cases[index] if index < len(cases) else None, "failed": index in failed}
-                known |= {"length": lengths[index] if index < len(lengths) else None}
-                rows.append(EpisodeRecord(**known, episode=index, episode_return=value))
-        outcome = self._record.outcome
-        known = self._known | {"split": "heldout", "submit": outcome.best_submit_index}
-        known |= {"case": None, "length": None, "failed": None}
+                row = made(
+                    split="train",
+                    submit=one.submit_index,
+                    episode=index,
+                    case=cases[index] if index < len(cases) else None,
+                    episode_return=value,
+                    length=lengths[index] if index < len(lengths) else None,
+                    failed=index in failed,
+                )
+                rows.append(row)
+        best, returns = outcome.best_submit_index, enumerate(outcome.heldout_returns)
         rows += [
-            EpisodeRecord(**known, episode=index, episode_return=value)
-            for index, value in enumerate(outcome.heldout_returns)
+            made(split="heldout", submit=best, episode=index, episode_return=value)
+            for index, value in returns
         ]
         return Records(EpisodeRecord, rows)
 

@@ -21,7 +21,7 @@ import platform
 from collections.abc import Awaitable, Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, get_args
+from typing import get_args
 
 import msgspec
 
@@ -74,21 +74,14 @@ class Capabilities:
     """Describes environments; see `describe_all`."""
     _describing: asyncio.Task[None] | None = field(default=None, init=False)
 
-    def announced(self) -> dict[str, Any]:
-        """The fields of `Register`, with reasons of accepted length; the log has them whole."""
+    def reasons(self) -> tuple[dict[str, str], dict[str, str]]:
+        """Why tiers and environments are missing, in the length that `Register` accepts; the log has them whole."""
         remaining, reasons = REASON_CHARACTERS["environments"], {}
         for env, why in self.failed_environments.items():
             reasons[env] = why[: min(REASON_CHARACTERS["environment"], remaining)]
             remaining -= len(reasons[env])
-        return {
-            "tiers": self.tiers,
-            "missing_tiers": {
-                tier: why[: REASON_CHARACTERS["tier"]] for tier, why in self.missing_tiers.items()
-            },
-            "environments": self.environments,
-            "undescribed": self.undescribed,
-            "failed_environments": reasons,
-        }
+        longest = REASON_CHARACTERS["tier"]
+        return {tier: why[:longest] for tier, why in self.missing_tiers.items()}, reasons
 
     async def keep_trying(self, register: Callable[[], Awaitable[None]]) -> None:
         """Tries what does not work from time to time, and registers after each change. Runs until cancelled."""

@@ -21,7 +21,6 @@ import time
 from collections import Counter, OrderedDict
 from collections.abc import AsyncIterator, Awaitable, Callable
 from pathlib import Path
-from typing import Any
 
 import msgspec
 
@@ -189,7 +188,8 @@ class Supervisor:
 
     async def _register(self) -> None:
         async with self._registering:
-            options, credentials = self._options, self._link.credentials
+            options, credentials, able = self._options, self._link.credentials, self._capabilities
+            missing_tiers, failed_environments = able.reasons()
             message = Register(
                 worker=options.name,
                 token=credentials.token,
@@ -199,7 +199,11 @@ class Supervisor:
                 host=options.host,
                 boot_id=options.boot_id,
                 installation=installs.own(),
-                **self._capabilities.announced(),
+                tiers=able.tiers,
+                missing_tiers=missing_tiers,
+                environments=able.environments,
+                undescribed=able.undescribed,
+                failed_environments=failed_environments,
             )
             reply = await self._ask.until_answered("register", message, Registered)
             self._session, self._lease_ttl_s, self._token = reply.session, reply.lease_ttl_s, message.token
@@ -492,7 +496,7 @@ class Supervisor:
                 task.cancel()
 
 
-async def _ended(*tasks: asyncio.Task[Any]) -> None:
+async def _ended(*tasks: asyncio.Task[object]) -> None:
     """Cancels these tasks, and returns once they have ended."""
     for task in tasks:
         task.cancel()

@@ -188,7 +188,7 @@ def _points(curve: Curve) -> tuple[list[Point], list[Point]]:
     return seen, hidden
 
 
-def _finite(metrics: dict[str, Any]) -> dict[str, float]:
+def _finite(metrics: dict[str, float | None]) -> dict[str, float]:
     known = {name: float(value) for name, value in metrics.items() if value is not None}
     return {name: value for name, value in known.items() if math.isfinite(value)}
 

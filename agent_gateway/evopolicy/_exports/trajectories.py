@@ -133,7 +133,9 @@ def _episodes(run: Run, name: str) -> Iterator[tuple[Any, dict[str, Any]]]:
                 "submit": submit.submit,
                 "episode": episode,
                 "policy_mean_return": submit.mean_return,
-                **{field: getattr(known, field, None) for field in ("case", "episode_return", "failed")},
+                "case": known and known.case,
+                "episode_return": known and known.episode_return,
+                "failed": known and known.failed,
             }
             pictures = [path.with_name(f"observations.{kind}") for kind in ("npz", "npy")]
             try:

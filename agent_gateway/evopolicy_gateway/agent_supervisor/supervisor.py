@@ -13,7 +13,6 @@ import signal
 import sys
 from collections.abc import Collection, Mapping
 from pathlib import Path
-from typing import Any
 
 import msgspec
 
@@ -85,7 +84,7 @@ async def keep(order: StartAgent, orders: Orders) -> AgentEnded:
         joins=resources.joins,
     )
     play = asyncio.create_task(_play(order, stage, config, resources))
-    ends: dict[str, asyncio.Task[Any]] = {
+    ends: dict[str, asyncio.Task[None] | asyncio.Task[str]] = {
         "told": asyncio.create_task(_stopped(orders, clock, activity)),
         "wall_limit": asyncio.create_task(clock.run_out()),
         "disk_limit": asyncio.create_task(resources.too_large()),
@@ -174,8 +173,7 @@ def secrets_in(environment: Mapping[str, str], config: AgentConfig | None) -> di
 
 
 def _tell(doing: messages.AgentDoing) -> None:
-    shown = {"action": doing.action[:_TEXT_SHOWN], "note": doing.note[:_TEXT_SHOWN]}
-    emit(msgspec.structs.replace(doing, **shown))
+    emit(msgspec.structs.replace(doing, action=doing.action[:_TEXT_SHOWN], note=doing.note[:_TEXT_SHOWN]))
 
 
 async def _tell_use(clock: AgentClock, resources: Resources) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import msgspec
 import typer
@@ -59,7 +59,7 @@ def run(
     where = Cluster(connect=tuple(connect or ()), file=credentials_file, patient=given.resume)
     held = jail.of_remote_agent() if given.agent == listener.AGENT else jail
     agent_host = listener.agent_host_of(given.agent, served.agent_host)
-    plans = _plans(given, [one_environment(env)], agent_host, jail=held, listener=served.listener())
+    plans = _checked(given.plans([one_environment(env)], held, agent_host, served.listener()))
     _play(plans, where, 1, as_json)
 
 
@@ -81,7 +81,7 @@ def local(
     Starts a coordinator and a worker, plays one run for each environment, and stops everything at the end.
     """
     check_installed(LOCAL)
-    plans = _plans(given, catalogue.resolve(env), jail=jail)
+    plans = _checked(given.plans(catalogue.resolve(env), jail))
     where = options.cluster_of(cluster, None, None, local=True)
     _play(plans, where, parallel, as_json)
 
@@ -98,7 +98,7 @@ def demo(
     """
     check_installed(LOCAL)
     given = RunOptions(agent="evolve", budget=32, exp_id="demo", overwrite=True, runs=runs)
-    plans = _plans(given, ["gym/continuouscar"])
+    plans = _checked(given.plans(["gym/continuouscar"], JailSettings()))
     where = options.cluster_of(ClusterOptions(), None, None, local=True)
     _play(plans, where, 1, as_json=False)
 
@@ -140,9 +140,10 @@ def try_policy(
         cluster = msgspec.structs.replace(cluster, policy_package=packages)
     where = options.cluster_of(cluster, connect, credentials_file)
     where = msgspec.structs.replace(where, unjailed=tier == "none")
-    where.check_ids([env_id], "train", ids)
-    given: dict[str, Any] = {"sandbox_tier": tier, "limits": limits, "as_json": as_json}
-    raise typer.Exit(run_to_end(trials.try_policy(env_id, policy, ids, out, where, **given)))
+    where.check_train(env_id, ids)
+    bundle = trials.policy_bundle(policy)
+    message = trials.evaluation(env_id, bundle, ids, tier, limits)
+    raise typer.Exit(run_to_end(trials.try_policy(bundle, message, out, where, as_json=as_json)))
 
 
 @app.command("diff", epilog="Example: evopolicy diff runs/evolve/gym_acrobot/a runs/evolve/gym_acrobot/b")
@@ -221,11 +222,8 @@ def finish(
         listener.finish(folder_of(run_directory))
 
 
-def _plans(given: RunOptions, env_ids: list[str], agent_host: str = "", **more: object) -> list[Plan]:
-    """A plan for each environment. Raises ConfigError for any error before anything is started."""
-    if given.resume and (given.overwrite or given.exp_id is None):
-        raise ConfigError("--resume needs --exp-id, and cannot be combined with --overwrite")
-    plans = given.plans(env_ids, Path.cwd(), agent_host, **more)
+def _checked(plans: list[Plan]) -> list[Plan]:
+    """Raises ConfigError for any error before anything is started."""
     check_apart(plans)
     for plan in plans:
         plan.check()

@@ -13,7 +13,6 @@ import signal
 import sys
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 from evopolicy_common.cli.conventions import FAILURE, code_of, setup_logging
 from evopolicy_common.errors import ConfigError
@@ -47,8 +46,9 @@ async def _serve(folder: RunFolder) -> bool:
         opened = pipeline.machine.run
         why = f"--video {opened.video}: {opened.env.env} does not render; there are no videos"
         notes = (why,) if opened.video != "off" and not opened.env.renders else ()
-        times = {"held_s": round(pipeline.machine.held_s, 3), "permit_s": round(gateway.permit_s, 3)}
-        child_messages.emit(Ready(variables=urls.environment(), notes=notes, **times))
+        held_s, permit_s = round(pipeline.machine.held_s, 3), round(gateway.permit_s, 3)
+        variables = urls.environment()
+        child_messages.emit(Ready(variables=variables, notes=notes, held_s=held_s, permit_s=permit_s))
 
     def changed(pipeline: SubmitPipeline) -> None:
         child_messages.emit(progress_of(pipeline.machine))
@@ -87,13 +87,15 @@ def progress_of(machine: TicketMachine) -> Progress:
     settled = [ticket for ticket in machine.tickets if ticket.status is not None]
     means = [ticket.mean_return for ticket in settled if ticket.mean_return is not None]
     running, last = machine.in_flight, settled[-1] if settled else None
-    fields = () if running is None else ("submit_id", "n_episodes", "n_done", "waits_for")
-    now: dict[str, Any] = {name: getattr(running, name) for name in fields}
     return Progress(
         episode_budget=machine.run.episode_budget,
         remaining_budget=machine.state.remaining_budget,
         n_submits=machine.state.n_submits,
         n_rejected=machine.n_rejected,
+        submit_id=running.submit_id if running else None,
+        n_episodes=running.n_episodes if running else 0,
+        n_done=running.n_done if running else 0,
+        waits_for=running.waits_for if running else "",
         last_submit_id=last.submit_id if last else None,
         last_status=last.status if last else None,
         last_mean=last.mean_return if last else None,
@@ -103,7 +105,6 @@ def progress_of(machine: TicketMachine) -> Progress:
         held_s=round(machine.held_s, 3),
         spent=machine.spent,
         cancelled=machine.cancelled,
-        **now,
     )
 
 

@@ -196,7 +196,8 @@ def _keep(index: Index, decision: Decision) -> None:
     entry = index.runs.get(run.name)
     if run.folder.run_json.exists() and (entry is None or entry.state not in FINISHED):
         record = read_record(run.folder.root)
-        known = {"digest": run.digest, "settings": msgspec.to_builtins(run.defining)}
+        made, settings = suite_index.entry_of(run, record), msgspec.to_builtins(run.defining)
         if entry is not None:
-            known = {"digest": entry.digest, "settings": entry.settings, "earlier": entry.earlier}
-        index.runs[run.name] = suite_index.entry_of(run, record, **known)
+            made = msgspec.structs.replace(made, digest=entry.digest, earlier=entry.earlier)
+            settings = entry.settings
+        index.runs[run.name] = msgspec.structs.replace(made, settings=settings)

@@ -263,10 +263,6 @@ class _Exchange:
         await self._send({"type": "http.response.body", "body": b"", "more_body": False})
 
 
-_COUNTS = ("episode_budget", "min_episodes_per_submit", "max_episodes_per_submit")
-_SETTINGS = ("policy_scope", "finish", "feedback", "observations", "sandbox_tier", "video")
-
-
 def info_document(machine: TicketMachine, left: Mapping[str, object] | None = None) -> dict[str, Any]:
     """The document of `GET /info`: everything that an agent may know of the run, as plain values.
 
@@ -274,9 +270,9 @@ def info_document(machine: TicketMachine, left: Mapping[str, object] | None = No
     """
     run, state = machine.run, machine.state
     env = run.env
-    env_meta = {name: getattr(env, name) for name in ("env", "env_version")}
+    env_meta: dict[str, object] = {"env": env.env, "env_version": env.env_version}
     env_meta |= {"n_env_instances": run.n_env_instances, "max_episode_steps": run.announced_steps}
-    env_meta |= {name: getattr(env, name) for name in ("obs_space", "action_space", "obs_storage")}
+    env_meta |= {"obs_space": env.obs_space, "action_space": env.action_space, "obs_storage": env.obs_storage}
     if run.profile != "own":
         env_meta |= published_forms.described(env.obs_space, env.action_space, env.obs_storage)
     elif names := env.reward_components:
@@ -291,10 +287,18 @@ def info_document(machine: TicketMachine, left: Mapping[str, object] | None = No
         },
         "env_meta": env_meta,
         "episode_ends_after": min(env.max_episode_steps, run.announced_steps),
-        **{name: getattr(run, name) for name in _COUNTS},
+        "episode_budget": run.episode_budget,
+        "min_episodes_per_submit": run.min_episodes_per_submit,
+        "max_episodes_per_submit": run.max_episodes_per_submit,
         "resource_limits": {"rollout_wall_s": rollout_wall_s} | msgspec.to_builtins(run.limits),
-        **{name: list(getattr(run, name)) for name in ("allowed_imports", "denied_imports")},
-        **{name: getattr(run, name) for name in _SETTINGS},
+        "allowed_imports": list(run.allowed_imports),
+        "denied_imports": list(run.denied_imports),
+        "policy_scope": run.policy_scope,
+        "finish": run.finish,
+        "feedback": run.feedback,
+        "observations": run.observations,
+        "sandbox_tier": run.sandbox_tier,
+        "video": run.video,
         "deterministic": env.deterministic,
         "end_grace_s": LAST_WORDS_S,
         "last_warning": machine.last_warning,

@@ -8,7 +8,6 @@ import socket
 import sys
 from collections.abc import Awaitable, Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
 from urllib.parse import urlsplit
 
 import msgspec
@@ -157,7 +156,7 @@ class Jail:
         """
         settings = order.settings
         self._open_network = settings.mode == "open-network"
-        self._limits: dict[str, Any] = {"pids": pids, "fixed_cores": fixed_cores}
+        self._pids, self._fixed_cores = pids, fixed_cores
         self._variables = frozenset(
             (*_PASSED, *settings.environment, *variables, *HARNESS_VARIABLES.get(harness, ()))
         )
@@ -200,7 +199,8 @@ class Jail:
 
     def way(self, program: Sequence[str]) -> Way:
         proxy = None if self._open_network else self._proxy()
-        return Way(self._view.arguments(), program, proxy, **self._limits)
+        words = self._view.arguments()
+        return Way(words, program, proxy, pids=self._pids, fixed_cores=self._fixed_cores)
 
     def sealed(self, program: Sequence[str]) -> Way:
         """One start of a program without network access, such as a CLI that prints its version."""

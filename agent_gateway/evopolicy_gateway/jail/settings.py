@@ -8,7 +8,7 @@ import shutil
 import subprocess
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal, get_args
+from typing import Annotated, ClassVar, Literal, get_args
 from urllib.parse import urlsplit
 
 import msgspec
@@ -59,10 +59,10 @@ class JailSettings(msgspec.Struct, frozen=True, kw_only=True):
         """The text for `run.json`."""
         return {"bwrap": "bwrap", "open-network": "bwrap, open network", "none": "none"}[self.mode]
 
-    def chosen(self) -> dict[str, Any]:
+    def chosen(self) -> dict[str, list[str]]:
         """The operator's additions to the jail, for `run.json`."""
-        names = ("read", "write", "environment", "hosts")
-        return {name: list(value) for name in names if (value := getattr(self, name))}
+        given = {"read": self.read, "write": self.write, "environment": self.environment, "hosts": self.hosts}
+        return {name: list(value) for name, value in given.items() if value}
 
     def of_remote_agent(self) -> JailSettings:
         """No jail, since the operator starts a remote agent. Raises ConfigError when one is requested."""

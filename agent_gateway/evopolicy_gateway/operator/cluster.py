@@ -6,7 +6,7 @@ import asyncio
 import contextlib
 from collections.abc import AsyncIterator, Collection, Iterable, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import msgspec
 
@@ -14,7 +14,6 @@ from evopolicy_common import catalogue
 from evopolicy_common.cli.conventions import end_on_sigterm
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.local.cluster import LocalCluster, Workers, local_cluster
-from evopolicy_common.messages.environment import Split
 from evopolicy_common.messages.episode import Tier
 from evopolicy_common.messages.run_settings import RunSettings
 from evopolicy_common.terminal import say
@@ -49,15 +48,13 @@ class Cluster(msgspec.Struct, frozen=True, kw_only=True):
                 " the published software, which holds gym/acrobot/train.json and so on"
             )
 
-    def check_ids(self, env_ids: Iterable[str], split: Split, cases: Sequence[int]) -> None:
+    def check_train(self, env_id: str, cases: Sequence[int]) -> None:
         """Raises ConfigError for cases that a local cluster lacks. Other clusters' case files state their numbers."""
         if self.local is None or self.local.data is not None:
             return
-        last = max(cases, default=-1)
-        for suite in map(catalogue.suite_of, env_ids):
-            n = getattr(suite, f"n_{split}")
-            if last >= n:
-                raise ConfigError(f"--cases: there is no {split} case {last}; the cases are 0 to {n - 1}")
+        last, n = max(cases, default=-1), catalogue.suite_of(env_id).n_train
+        if last >= n:
+            raise ConfigError(f"--cases: there is no train case {last}; the cases are 0 to {n - 1}")
 
 
 class Reached(NamedTuple):
@@ -73,10 +70,17 @@ async def reached(where: Cluster, workers: Workers | None = None) -> AsyncIterat
         local: LocalCluster | None = None
         file, opened = where.file, None
         if (chosen := where.local) is not None:
-            names = ("state", "data", "hidden_isolation", "env_timeout", "env_memory")
-            given: dict[str, Any] = {name: getattr(chosen, name) for name in names}
-            given |= {"unjailed": where.unjailed, "policy_packages": tuple(chosen.policy_package or ())}
-            starting = local_cluster("local", workers=workers, **given)
+            starting = local_cluster(
+                "local",
+                state=chosen.state,
+                data=chosen.data,
+                hidden_isolation=chosen.hidden_isolation,
+                unjailed=where.unjailed,
+                workers=workers,
+                policy_packages=tuple(chosen.policy_package or ()),
+                env_timeout=chosen.env_timeout,
+                env_memory=chosen.env_memory,
+            )
             local = await stack.enter_async_context(starting)
             if local.note:
                 say(f"note: {local.note}", err=True)

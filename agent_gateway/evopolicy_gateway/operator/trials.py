@@ -8,7 +8,6 @@ import itertools
 import uuid
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import msgspec
 from rich.progress import Progress
@@ -17,14 +16,13 @@ from evopolicy_common import catalogue
 from evopolicy_common.console import Terminal, table, terminal
 from evopolicy_common.errors import BundleError, ConfigError, raised_as
 from evopolicy_common.local.cluster import unless_failed
-from evopolicy_common.messages.environment import Split
-from evopolicy_common.messages.episode import EpisodeOutcome
+from evopolicy_common.messages.episode import EpisodeOutcome, ResourceLimits, Tier
 from evopolicy_common.messages.operator import Evaluate
 from evopolicy_common.processes.notices import Waiting
 from evopolicy_common.processes.preflight import check_writable
 from evopolicy_common.records.aggregates import mean, std
 from evopolicy_common.records.episodes import rendered
-from evopolicy_common.records.policies import bundles
+from evopolicy_common.records.policies.bundles import Bundle
 from evopolicy_common.records.policies.checkpoints import bundle_of
 from evopolicy_common.terminal import one_line, say, say_json
 from evopolicy_gateway.operator.cluster import Cluster, connected
@@ -33,19 +31,19 @@ from evopolicy_gateway.submits.formatting import cut_text, failure_text
 
 
 def evaluation(
-    env: str, bundle: str | None, split: Split, cases: Sequence[int] | None, **more: Any
+    env: str, bundle: Bundle, cases: Sequence[int], tier: Tier, limits: ResourceLimits
 ) -> Evaluate:
-    """The request for cases outside any run; `bundle` None: uniform random actions, `more`: further fields."""
+    """The request for train cases outside any run."""
     return Evaluate(
-        token="",
         key=uuid.uuid4().hex,
         env=env,
-        bundle=bundle,
-        split=split,
-        cases=None if cases is None else tuple(cases),
+        bundle=bundle.digest,
+        split="train",
+        cases=tuple(cases),
+        sandbox_tier=tier,
+        limits=limits,
         step_limit="published",
         definition=catalogue.pinned(env),
-        **more,
     )
 
 
@@ -58,7 +56,7 @@ class TriedEpisode(msgspec.Struct, frozen=True, kw_only=True):
     """Category, step and message of the policy's failure; uniform random actions played from that step on."""
     failed_at: int | None = None
     """Step of the failure; None without a failure, or before the first step."""
-    folder: str | None = None
+    folder: str
 
     @property
     def played_by(self) -> str:
@@ -78,35 +76,31 @@ class TrialResult(msgspec.Struct, frozen=True, kw_only=True):
     n_failed: int
     """Cases in which the policy failed; their returns, mostly of random actions, are excluded from the mean."""
     episodes: tuple[TriedEpisode, ...]
-    folder: str | None = None
+    folder: str
     other_cases_next_time: bool = False
     """The cases derive from the secret of a temporary cluster: another call has other cases under the same ids."""
 
 
-async def try_policy(
-    env: str, policy: Path, cases: Sequence[int], out: Path, where: Cluster, *, as_json: bool, **more: object
-) -> int:
+async def try_policy(bundle: Bundle, message: Evaluate, out: Path, where: Cluster, *, as_json: bool) -> int:
     """Plays the policy on train cases and prints the results; returns 1 if it failed in an episode, else 0.
 
-    `out`: folder for trajectories; `more`: as for `evaluation`. Raises ConfigError when `policy` holds none.
+    `message`: of `evaluation`; `out`: folder for trajectories.
     """
-    bundle = policy_bundle(policy)
     check_writable(out, "--out")
     console = terminal(stderr=as_json)
     notes: set[str] = set()
-    message = evaluation(env, bundle.digest, "train", cases, **more)
 
     async def work(operations: Operations) -> TrialResult:
         await operations.upload(bundle.digest, bundle.packed)
         result = await _result(message, where, operations, console, out)
-        if not catalogue.is_shipped(env):
+        if not catalogue.is_shipped(message.env):
             offered = (each.description for each in (await operations.environments())[0])
-            notes.update(each.notes() for each in offered if each.env == env)
+            notes.update(each.notes() for each in offered if each.env == message.env)
         return result
 
-    async with connected(where, [env], {message.sandbox_tier}) as (operations, _, failed):
+    async with connected(where, [message.env], {message.sandbox_tier}) as (operations, _, failed):
         result = await unless_failed(asyncio.create_task(work(operations)), failed)
-    _print([result], as_json, console)
+    _print(result, as_json, console)
     for note in filter(None, notes):
         say(f"note: {note}", err=True)
     return int(any(episode.failure for episode in result.episodes))
@@ -128,27 +122,23 @@ async def _outcomes(operations: Operations, message: Evaluate, console: Terminal
 
 
 async def _result(
-    message: Evaluate, where: Cluster, operations: Operations, console: Terminal, out: Path | None = None
+    message: Evaluate, where: Cluster, operations: Operations, console: Terminal, out: Path
 ) -> TrialResult:
-    """Plays the cases. `out`: writes their files into a new folder there."""
+    """Plays the cases, and writes their files into a new folder in `out`."""
     outcomes = await _outcomes(operations, message, console)
-    folder = None if out is None else await asyncio.to_thread(_new_folder, out, message.env)
+    folder = await asyncio.to_thread(_new_folder, out, message.env)
     episodes = []
-    cases = range(len(outcomes)) if message.cases is None else message.cases
-    for outcome, case in zip(outcomes, cases, strict=True):
-        target = None
-        if folder is not None:
-            target = folder / f"ep_{outcome.index:03d}"
-            ref = outcome.trajectory
-            packed = None if ref is None else await operations.fetch(ref)
-            await asyncio.to_thread(_write, target, packed, outcome)
+    for outcome, case in zip(outcomes, message.cases or (), strict=True):
+        target, ref = folder / f"ep_{outcome.index:03d}", outcome.trajectory
+        packed = None if ref is None else await operations.fetch(ref)
+        await asyncio.to_thread(_write, target, packed, outcome)
         tried = TriedEpisode(
             case=case,
             episode_return=outcome.episode_return if outcome.length else None,
             length=outcome.length,
             failure=failure_text(outcome.failure),
             failed_at=None if outcome.failure is None else outcome.failure.step_index,
-            folder=None if target is None else str(target),
+            folder=str(target),
         )
         episodes.append(tried)
     good = [one for one in episodes if one.failure is None]
@@ -160,7 +150,7 @@ async def _result(
         std_return=std(returns) if returns else None,
         n_failed=len(episodes) - len(good),
         episodes=tuple(episodes),
-        folder=None if folder is None else str(folder),
+        folder=str(folder),
         other_cases_next_time=local is not None and local.state is None and local.data is None,
     )
 
@@ -176,7 +166,7 @@ def _write(target: Path, packed: bytes | None, outcome: EpisodeOutcome) -> None:
         (target / name).write_bytes(data)
 
 
-def policy_bundle(policy: Path) -> bundles.Bundle:
+def policy_bundle(policy: Path) -> Bundle:
     """Bundles the policy in a folder, or in `system/` below it. Raises ConfigError when it is missing or invalid."""
     folder = policy if (policy / "policy.py").is_file() else policy / "system"
     if not (folder / "policy.py").is_file():
@@ -197,20 +187,12 @@ def _new_folder(out: Path, env: str) -> Path:
     return folder
 
 
-def _print(results: Sequence[TrialResult], as_json: bool, console: Terminal) -> None:
+def _print(result: TrialResult, as_json: bool, console: Terminal) -> None:
     if as_json:
-        say_json(results)
+        say_json([result])
         return
-    if len(results) == 1:
-        _print_episodes(results[0], console)
-    else:
-        numbers = ("episodes", "mean return", "population std")
-        made = table("environment", *numbers, right=numbers)
-        for result in results:
-            means = f"{result.mean_return:.4g}", f"{result.std_return:.4g}"
-            made.add_row(result.env, str(len(result.episodes)), *means)
-        console.print(made)
-    if any(result.other_cases_next_time for result in results):
+    _print_episodes(result, console)
+    if result.other_cases_next_time:
         console.print(
             "note: this cluster's cases end with it, the next call has others under the same ids;"
             " leave out --fresh, or give --data DIR or --connect, to keep them the same",
@@ -219,17 +201,14 @@ def _print(results: Sequence[TrialResult], as_json: bool, console: Terminal) -> 
 
 
 def _print_episodes(result: TrialResult, console: Terminal) -> None:
-    # Random actions alone have no policy, and no folder.
-    numbers, more = ("case", "return", "steps"), () if result.folder is None else ("played by", "failure")
-    made = table(*numbers, *more, right=numbers)
+    numbers = ("case", "return", "steps")
+    made = table(*numbers, "played by", "failure", right=numbers)
     for one in result.episodes:
         shown = "–" if one.episode_return is None else f"{one.episode_return:.4g}"
-        cells = (str(one.case), shown, str(one.length), one.played_by, one_line(one.failure or ""))
-        made.add_row(*cells[: 3 + len(more)])
+        made.add_row(str(one.case), shown, str(one.length), one.played_by, one_line(one.failure or ""))
     console.print(made)
     console.print(_summary(result), soft_wrap=True)
-    if result.folder is not None:
-        console.print(f"trajectories and errors: {result.folder}", soft_wrap=True)
+    console.print(f"trajectories and errors: {result.folder}", soft_wrap=True)
 
 
 def _summary(result: TrialResult) -> str:

@@ -18,7 +18,6 @@ import stat
 import time
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any
 
 import msgspec
 
@@ -54,7 +53,9 @@ class Resources:
             for name, controller in _CONTROLLERS.items()
             if controller in held and getattr(asked, name) is not None
         }
-        values: dict[str, Any] = {name: None for name in _CONTROLLERS if name not in by}
+        cpus = asked.cpus if "cpus" in by else None
+        memory_bytes = asked.memory_bytes if "memory_bytes" in by else None
+        pids = asked.pids if "pids" in by else None
         self.fixed_cores = bool(asked.cpus and "cpus" not in by and jailed)
         """Whether the programs may not choose their cores."""
         if self.fixed_cores:
@@ -63,15 +64,16 @@ class Resources:
             first = os.getpid() % len(cores)
             chosen = (cores[first:] + cores[:first])[: math.ceil(asked.cpus or 0)]
             os.sched_setaffinity(0, chosen)
-            values["cpus"], by["cpus"] = float(len(chosen)), "affinity"
+            cpus, by["cpus"] = float(len(chosen)), "affinity"
         self.own_pids: int | None = None
         """Resource limit for the programs themselves."""
         release = tuple(map(int, re.findall(r"\d+", os.uname().release)[:2]))
         counted = release >= _COUNTED_BY_NAMESPACE and os.getuid() != 0
         if asked.pids and "pids" not in by and jailed and counted:
-            self.own_pids = values["pids"] = asked.pids
+            self.own_pids = pids = asked.pids
             by["pids"] = "rlimit"
-        self._now = AgentResources(limits=msgspec.structs.replace(asked, **values), kept_by=by)
+        kept = msgspec.structs.replace(asked, cpus=cpus, memory_bytes=memory_bytes, pids=pids)
+        self._now = AgentResources(limits=kept, kept_by=by)
 
     def limits_text(self) -> str:
         """For the operator: the requested limits and the mechanism that keeps each; empty without any."""

@@ -97,8 +97,8 @@ class AnswerReader:
         self.complete = self.complete or not self._events or not self._shape.last
         return rest
 
-    def metered(self, input_tokens: int) -> dict[str, Any]:
-        """The counts so far, as fields of a `limits.Request`. `input_tokens`: estimated from the request."""
+    def metered(self, input_tokens: int) -> tuple[Usage, bool, str, str]:
+        """The counts, whether they are estimated, model and tier. `input_tokens`: estimated from the request."""
         guessed = set(self._wrong)
         tokens: dict[str, int] = {}
         for kind, paths in self._shape.counts.items():
@@ -124,7 +124,7 @@ class AnswerReader:
             output=tokens["output"],
             reasoning=None if reasoning is None else min(reasoning, tokens["output"]),
         )
-        return {"usage": usage, "estimated": bool(guessed), "answered": self._model, "tier": self._tier}
+        return usage, bool(guessed), self._model, self._tier
 
     def _read_event(self, event: bytes) -> bool:
         """Returns whether the event has counts alone."""

@@ -19,6 +19,7 @@ from typing import Any, Protocol
 import httpcore
 import msgspec
 import orjson
+from msgspec.structs import replace
 
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.records import model_record
@@ -127,7 +128,7 @@ class Recorder:
         if self._n >= model_record.MAX_CALLS:
             raise ValueError(f"its limit of {model_record.MAX_CALLS:,} calls is reached")
         request = canonical(sent.name, self._clean(sent.body))
-        call: dict[str, Any] = {"status": 0, "broken": True}
+        line = Call(n=n, api=sent.name, method=sent.method, digest=key_of(request), status=0, broken=True)
         if answer is not None:
             data = self._clean(bytes(answer.heard))
             passed = itertools.islice(apis.passed_down(answer.got.headers).items(), _MAX_HEADERS)
@@ -135,13 +136,12 @@ class Recorder:
                 (name, self._clean(value.encode()).decode("utf-8", "replace")) for name, value in passed
             )
             headers = {name: value[:_MAX_HEADER] for name, value in cleaned}
-            call |= {"status": answer.got.status, "headers": headers, "broken": not answer.ended}
-            call |= {"answer": "" if answer.left_out else key_of(data), "left_out": answer.left_out}
+            line = replace(line, status=answer.got.status, headers=headers, broken=not answer.ended)
+            line = replace(line, answer="" if answer.left_out else key_of(data), left_out=answer.left_out)
             if self._pack is not None and not answer.left_out:
                 self._pack.put(data)
         if self._pack is not None:
-            call["request"] = _put_request(self._pack, request)
-        line = Call(n=n, api=sent.name, method=sent.method, digest=key_of(request), **call)
+            line = replace(line, request=_put_request(self._pack, request))
         self._calls.write(msgspec.json.encode(line) + b"\n")
         self._n += 1
 

@@ -11,10 +11,9 @@ import zlib
 from collections.abc import AsyncIterator, Callable, Mapping
 from email.utils import parsedate_to_datetime
 from pathlib import Path
-from typing import Any
 
 import httpcore
-import msgspec
+from msgspec.structs import replace
 from starlette.requests import ClientDisconnect, Request
 from starlette.responses import Response, StreamingResponse
 from starlette.types import Receive, Scope, Send
@@ -359,7 +358,7 @@ class _Exchange:
         """Sends a request and reads its answer. Returns False where the next try should be sent."""
         relay = self._relay
         async with relay.provider.sent(sent) as got:
-            self._line = msgspec.structs.replace(self._line, status=got.status)
+            self._line = replace(self._line, status=got.status)
             kind = got.headers.get("content-type", "").partition(";")[0].strip().lower()
             events = kind == "text/event-stream"
             if 200 <= got.status < 300 and (events or kind.endswith("json")):
@@ -428,31 +427,31 @@ class _Exchange:
             yield piece
 
     async def _put(self, piece: bytes | Exception | None) -> None:
-        parts: list[Any] = [piece]
+        parts: list[bytes | Exception | None] = [piece]
         if isinstance(piece, bytes):
             parts = [piece[at : at + _CHUNK] for at in range(0, len(piece), _CHUNK)]
         for part in parts:
             if not self._left:
                 await self._pieces.put(part)
 
-    def _write(self, error: Exception | None = None, **more: Any) -> None:
+    def _write(self, error: Exception | None = None, *, broken: bool = False, wait_s: float = 0.0) -> None:
         """Counts the request, once. One that broke off is charged for its input at least, and for all that it might
         have used if its provider had the time for that."""
         if self._written:
             return
         self._written = True
-        tier = self._facts.tier
+        line, tier = replace(self._line, broken=broken, wait_s=wait_s), self._facts.tier
         if self._reader is not None and not self._route.free:
-            more |= self._reader.metered(self._facts.input)
-            tier = more.pop("tier") or tier
+            usage, estimated, answered, told = self._reader.metered(self._facts.input)
+            line, tier = replace(line, usage=usage, estimated=estimated, answered=answered), told or tier
         elif not self._line.status and not isinstance(error, NOT_SENT) and not self._route.free:
             late = isinstance(error, httpcore.ReadTimeout)
             usage = self.reserve.usage if late else Usage(input_noncached=self._facts.input)
-            more |= {"usage": usage, "estimated": True}
-        more["tier"] = "" if tier in requests.USUAL_TIERS else tier
-        more["first_s"] = None if self._first_s is None else round(self._first_s, 4)
-        more["whole_s"] = round(time.monotonic() - self._begun, 4)
-        self._relay.count(msgspec.structs.replace(self._line, **more), self.reserve)
+            line = replace(line, usage=usage, estimated=True)
+        tier = "" if tier in requests.USUAL_TIERS else tier
+        first_s = None if self._first_s is None else round(self._first_s, 4)
+        whole_s = round(time.monotonic() - self._begun, 4)
+        self._relay.count(replace(line, tier=tier, first_s=first_s, whole_s=whole_s), self.reserve)
 
 
 async def _unpacked(answer: Answer) -> AsyncIterator[bytes]:

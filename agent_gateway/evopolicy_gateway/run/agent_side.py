@@ -20,6 +20,7 @@ from evopolicy_gateway.processes import child_messages as messages
 from evopolicy_gateway.processes.child_messages import Progress
 from evopolicy_gateway.run import model_relay, record
 from evopolicy_gateway.run.children import GatewayProcess, OpenRun, SupervisedAgent
+from evopolicy_gateway.run.times import Times
 from evopolicy_gateway.workspace.agents_md import LAST_WORDS_S
 
 T = TypeVar("T")
@@ -59,7 +60,7 @@ class AgentSide:
         if self._run.folder.closing.exists():
             await self.close_again()
             return
-        tasks: list[asyncio.Task[Any]] = []
+        tasks: list[asyncio.Task[object]] = []
 
         def begin(work: Coroutine[Any, Any, T]) -> asyncio.Task[T]:
             tasks.append(task := asyncio.create_task(work))
@@ -130,12 +131,12 @@ class AgentSide:
 
     async def _on_progress(self, progress: Progress) -> None:
         stopwatch = self._run.stopwatch
-        stopwatch.reported("gateway", in_flight_s=progress.in_flight_s, feedback_s=progress.feedback_s)
+        times = Times(in_flight_s=progress.in_flight_s, feedback_s=progress.feedback_s)
+        stopwatch.reported("gateway", times)
         self._run.watch.progress(self._run.plan.name, progress)
-        seen: dict[str, Any] = {"running": progress.submit_id is not None}
-        seen |= {"held_s": stopwatch.held_reported(progress.held_s)}
+        held_s, running = stopwatch.held_reported(progress.held_s), progress.submit_id is not None
         asked = progress.n_submits + progress.n_rejected
-        await self.agent.note_submits(messages.SubmitsSeen(asked=asked, **seen))
+        await self.agent.note_submits(messages.SubmitsSeen(asked=asked, running=running, held_s=held_s))
         self.cancelled = self.cancelled or progress.cancelled
         if progress.spent:
             self._spent.set()

@@ -23,7 +23,7 @@ from evopolicy_gateway.processes.child_messages import AgentEnded, Child, Progre
 from evopolicy_gateway.relay.limits import read_ledger
 from evopolicy_gateway.run.operations import Operations
 from evopolicy_gateway.run.plan import Plan
-from evopolicy_gateway.run.times import Stopwatch
+from evopolicy_gateway.run.times import Stopwatch, Times
 from evopolicy_gateway.run.watch import View
 from evopolicy_gateway.run_folder.layout import RunFolder
 from evopolicy_gateway.run_folder.listener import TOKEN_VARIABLE, place_notice
@@ -214,7 +214,7 @@ class SupervisedAgent(Kept):
                     run.watch.doing(plan.name, event)
                 case messages.AgentUsed():
                     resources = event.resources if plan.listener is None else None
-                    run.stopwatch.reported("agent", agent_s=event.used_s, resources=resources)
+                    run.stopwatch.reported("agent", Times(agent_s=event.used_s, resources=resources))
                     if plan.settings.profile == "own":
                         self._keep_left()
                 case messages.AgentSurvives():

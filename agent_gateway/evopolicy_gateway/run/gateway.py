@@ -18,8 +18,8 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import time
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Awaitable, Callable
+from typing import Any, TypeVar
 
 from evopolicy_common.errors import ConfigError, RefusedError
 from evopolicy_common.logs import log
@@ -37,6 +37,7 @@ from evopolicy_gateway.submits.pipeline import SubmitPipeline
 from evopolicy_gateway.workspace import staging as workspace
 from evopolicy_gateway.workspace.agents_md import Urls
 
+T = TypeVar("T")
 _POLL_S = 1.0
 _REPORT_S = 0.1
 """Pause after a report of changes: a submit changes ten times, and each report wakes three processes."""
@@ -163,7 +164,7 @@ class Gateway:
         self._on_wait("")
         return not self._stopped.is_set()
 
-    async def _unless(self, order: Any, wanted: Any) -> Any:
+    async def _unless(self, order: Awaitable[object], wanted: Awaitable[T]) -> T | None:
         """The result of `wanted`, or None when the order comes first."""
         task, ordered = asyncio.ensure_future(wanted), asyncio.ensure_future(order)
         await asyncio.wait([task, ordered], return_when=asyncio.FIRST_COMPLETED)

@@ -69,7 +69,6 @@ class RunLifecycle:
         operations: Operations,
         gateway: Credentials,
         watch: View,
-        *,
         leaves: Leaves = "nothing",
         on_agent_gone: Callable[[], None] = lambda: None,
     ) -> None:

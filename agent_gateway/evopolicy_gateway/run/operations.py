@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 from collections.abc import AsyncGenerator, AsyncIterator, Callable, Sequence
 from pathlib import Path
-from typing import Any
 
 import msgspec
 
@@ -44,9 +43,11 @@ class Operations(OperatorClient):
     async def create(self, wanted: messages.CreateRun) -> messages.RunCreated:
         """Opens a run, perhaps again; the same key returns the same run. Raises ConfigError for refused settings."""
         message = msgspec.structs.replace(wanted, token=self._token)
+        timeout_s = None if wanted.run else TIMEOUT_S
         try:
-            known: dict[str, Any] = {"despite": _AWAY, "timeout_s": None if wanted.run else TIMEOUT_S}
-            created = await self._requests.until_answered("create", message, messages.RunCreated, **known)
+            created = await self._requests.until_answered(
+                "create", message, messages.RunCreated, timeout_s=timeout_s, despite=_AWAY
+            )
         except RefusedError as error:
             raise _settings_error(error) from error
         self._intended[created.run] = msgspec.structs.replace(wanted, run=created.run)
@@ -101,18 +102,9 @@ class Operations(OperatorClient):
             )
             await self.create(self._intended[run])
 
-    async def claim(
-        self,
-        suite: str,
-        name: str,
-        holder: str,
-        ttl_s: float,
-        run: str = "",
-        result: dict[str, object] | None = None,
-    ) -> messages.ClaimState:
+    async def claim(self, wanted: messages.Claim) -> messages.ClaimState:
         """Takes, renews, releases (`ttl_s` 0) or settles (`result`) a run of a sweep."""
-        known: dict[str, Any] = {"suite": suite, "name": name, "holder": holder, "ttl_s": ttl_s}
-        message = messages.Claim(token=self._token, **known, run=run, result=result)
+        message = msgspec.structs.replace(wanted, token=self._token)
         return await self._requests.until_answered("claim", message, messages.ClaimState, despite=_AWAY)
 
     async def drop(self, folder: RunFolder) -> None:

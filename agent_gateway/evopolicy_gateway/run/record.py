@@ -14,7 +14,7 @@ import asyncio
 import contextlib
 import os
 import traceback
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
@@ -75,7 +75,6 @@ def why_failed(error: Exception, log: Path) -> str:
     return why
 
 
-_NO_TIMES = Times()
 INTERRUPTED = "interrupted by you (Ctrl-C or SIGTERM)"
 """The error of a run that its command gave up for that reason."""
 CANCELLED = (
@@ -126,12 +125,12 @@ async def write(
         with optional("the selected policy in workspace/system"):
             files = checkpoints.without_metadata(selected.files)
             await asyncio.to_thread(_put_in_place, folder.system, files)
-    known: dict[str, Any] = {"code": code, "error": finished.error}
+    gave_up, why = False, finished.error
     if finished.status == "cancelled":
-        known["gave_up"] = error not in (None, INTERRUPTED)
-        known["error"] = error or finished.error or CANCELLED
+        gave_up, why = error not in (None, INTERRUPTED), error or finished.error or CANCELLED
+    replays: tuple[Replay, ...] = ()
     with optional("the recordings of held-out episodes"):
-        known["replays"] = await fetch_replays(folder.root, finished, operations)
+        replays = await fetch_replays(folder.root, finished, operations)
 
     def finish() -> RunRecord:
         staged = saved(folder.staged, Staged) if folder.staged.exists() else None
@@ -140,15 +139,25 @@ async def write(
             folder.agent_log.touch()
         with optional("logs/env.log"):
             write_atomically(folder.env_log, _env_log(finished))
+        transitions: dict[str, int] | None = None
         # At the level `scores` the feedback has no rows to count.
         if plan.settings.feedback != "scores":
             with optional("the number of steps"):
-                known["transitions"] = count_transitions(folder.feedback)
+                transitions = count_transitions(folder.feedback)
         facts = finished.agent
         with optional("the agent's use of its model"):
             facts = _complete(folder, plan, facts)
-        known["artifacts"] = folder.artifacts()
-        done = account.run_record(finished, claims(plan, facts, staged, rejected, times, **known))
+        told = msgspec.structs.replace(
+            claims(plan, facts, staged, times),
+            error=why,
+            gave_up=gave_up,
+            code=code,
+            transitions=transitions,
+            rejected_submits=tuple(rejected),
+            artifacts=folder.artifacts(),
+            replays=replays,
+        )
+        done = account.run_record(finished, told)
         write_atomically(folder.run_json, encode_run_record(done))
         # A later command removes the rest.
         with contextlib.suppress(OSError):
@@ -161,41 +170,32 @@ async def write(
     return done
 
 
-def claims(
-    plan: Plan,
-    facts: dict[str, object],
-    staged: Staged | None = None,
-    rejected: Sequence[schema.RejectedSubmit] = (),
-    times: Times = _NO_TIMES,
-    **more: Any,
-) -> Claims:
-    """What this side knows of a run; pure. `facts`: about the agent. `staged` None: no workspace. `more`: of
-    `Claims`."""
-    if staged is not None:
-        more |= {name: sha256_text(digest) for name, digest in msgspec.structs.asdict(staged).items()}
+def claims(plan: Plan, facts: dict[str, object], staged: Staged | None, times: Times) -> Claims:
+    """What this side knows of a run before its end; pure. `facts`: about the agent. `staged` None: no workspace."""
     return Claims(
         agent=_agent(plan, facts, times),
         jail=plan.jail.recorded,
+        agents_md_hash="" if staged is None else sha256_text(staged.agents_md_hash),
+        rules_hash="" if staged is None else sha256_text(staged.rules_hash),
+        initial_policy_hash=None if staged is None else sha256_text(staged.initial_policy_hash),
         harness=f"evopolicy {version('evopolicy')}",
         agent_s=max(0.0, times.open_s - times.in_flight_s),
         feedback_s=times.feedback_s,
         held_s=times.held_s,
         permit_s=times.permit_s,
-        rejected_submits=tuple(rejected),
-        **more,
     )
 
 
 def told_at_close(folder: RunFolder, plan: Plan, facts: dict[str, object], times: Times) -> dict[str, Any]:
     """The `Told` of `run.json`, as it is published: the coordinator commits to it when the run ends."""
     staged = saved(folder.staged, Staged) if folder.staged.exists() else None
-    known = claims(plan, _complete(folder, plan, facts), staged, times=times)
+    known = claims(plan, _complete(folder, plan, facts), staged, times)
     settings = {
         name: each for name, each in known.agent.settings.items() if name in schema.PUBLISHED_SETTINGS
     }
-    told = {name: getattr(known, name) for name in account.Told.__struct_fields__}
-    told["agent"] = msgspec.structs.replace(known.agent, settings=settings)
-    return cast(dict[str, Any], msgspec.to_builtins(told))
+    told = msgspec.convert(known, account.Told, from_attributes=True)
+    agent = msgspec.structs.replace(known.agent, settings=settings)
+    return cast(dict[str, Any], msgspec.to_builtins(msgspec.structs.replace(told, agent=agent)))
 
 
 def _complete(folder: RunFolder, plan: Plan, facts: dict[str, Any]) -> dict[str, Any]:
@@ -215,7 +215,7 @@ def _complete(folder: RunFolder, plan: Plan, facts: dict[str, Any]) -> dict[str,
             known["model_string"] = max(state.used, key=lambda model: state.used[model].total)
             known |= {"tokens": state.usage.recorded(None), "model_use": schema.ModelUse(metering="agent")}
         return known
-    limits = schema.ModelLimits(**msgspec.structs.asdict(terms.limits))
+    limits = msgspec.convert(terms.limits, schema.ModelLimits, from_attributes=True)
     own = facts.get("tokens") or (state.usage.recorded(terms.prices) if state.usage.total else None)
     if not folder.model_requests.exists():
         return known | {"tokens": own, "model_use": schema.ModelUse(metering="agent", limits=limits)}
@@ -228,9 +228,12 @@ def _complete(folder: RunFolder, plan: Plan, facts: dict[str, Any]) -> dict[str,
     known["model_use"] = schema.ModelUse(
         metering="relay",
         limits=limits,
+        requests=used.requests,
         requests_failed=used.failed,
         requests_estimated=used.estimated,
-        **{name: getattr(used, name) for name in ("requests", "models", "other_models", "hosted_tools")},
+        models=used.models,
+        other_models=used.other_models,
+        hosted_tools=used.hosted_tools,
         first_token_s=round(used.first_s / answered, 4) if answered else None,
         rate_limit_s=round(used.wait_s, 3),
         record=plan.record_model,
@@ -305,13 +308,13 @@ def _meta(submit: SubmitResult) -> CheckpointMeta:
 def _env_log(finished: RunFinished) -> bytes:
     """JSON lines: the environment's version, the played episodes and their results."""
     settings, best = finished.settings, finished.best_submit_index
-    events: list[tuple[str, dict[str, Any]]] = [
+    events: list[tuple[str, dict[str, object]]] = [
         ("environment", {"env": settings.env, "version": finished.env_version})
     ]
-    for submit in finished.submits:
-        times = {name: utc_text(getattr(submit, name)) for name in ("started_at", "completed_at")}
-        played = {name: getattr(submit, name) for name in ("env_instances", "status", "mean_return")}
-        events.append(("train", {"submit_index": submit.submit_index, **times, **played}))
+    for one in finished.submits:
+        times = {"started_at": utc_text(one.started_at), "completed_at": utc_text(one.completed_at)}
+        played = {"env_instances": one.env_instances, "status": one.status, "mean_return": one.mean_return}
+        events.append(("train", {"submit_index": one.submit_index, **times, **played}))
     for index, score in finished.val_scores.items():
         events.append(("validation", {"submit_index": index, "mean_return": score}))
     events += [("not_eligible", {"submit_index": index}) for index in finished.validation_ineligible]
@@ -359,8 +362,7 @@ async def fetch_replays(root: Path, finished: RunFinished, operations: Operation
                 continue
             target.parent.mkdir(parents=True, exist_ok=True)
             await asyncio.to_thread(write_atomically, target, data)
-        known: dict[str, Any] = {"episode_return": outcome.episode_return, "length": outcome.length}
-        recordings.append(
-            Replay(path=path, split="heldout", episode=outcome.index, submit_index=index, **known)
-        )
+        replay = Replay(path=path, split="heldout", episode=outcome.index, submit_index=index)
+        played = msgspec.structs.replace(replay, episode_return=outcome.episode_return, length=outcome.length)
+        recordings.append(played)
     return tuple(sorted(recordings, key=lambda replay: replay.episode))

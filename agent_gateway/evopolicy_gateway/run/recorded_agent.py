@@ -100,8 +100,8 @@ def plan_of(run: Path, runs: Path, *, trusted: bool = False) -> Plan:
             ) from error
     replays = msgspec.structs.replace(replays, folder=folder.model_record)
     settings = msgspec.structs.replace(plan.settings, replay_of=replays.run)
-    again = {"overwrite": True, "resume": False, "record_model": "digests"}
-    plan = msgspec.structs.replace(plan, runs=runs, settings=settings, replays=replays, **again)
+    plan = msgspec.structs.replace(plan, runs=runs, settings=settings, replays=replays)
+    plan = msgspec.structs.replace(plan, overwrite=True, resume=False, record_model="digests")
     if plan.folder.root.resolve() == folder.root.resolve():
         raise ConfigError(f"a replay in {runs} would take the place of {run}; choose another --runs")
     return plan

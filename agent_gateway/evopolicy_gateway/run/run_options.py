@@ -11,6 +11,7 @@ from typing import Annotated, Any, ClassVar, Literal
 
 import msgspec
 from msgspec import Meta
+from msgspec.structs import replace
 
 from evopolicy_common import catalogue
 from evopolicy_common.errors import ConfigError, ProtocolError, RequestError
@@ -25,6 +26,7 @@ from evopolicy_common.records.run_record import AgentLimits
 from evopolicy_gateway import harnesses
 from evopolicy_gateway.declared import Count, Option, Several
 from evopolicy_gateway.harnesses.interface.agent_config import AgentConfig
+from evopolicy_gateway.jail.settings import JailSettings
 from evopolicy_gateway.processes.clock import SILENCE_S
 from evopolicy_gateway.run.plan import WALL_S, Plan, Texts, find_start, read_prices, read_texts
 from evopolicy_gateway.run_folder.listener import Listener, listener_of
@@ -71,7 +73,7 @@ def limits_from(values: Mapping[str, float], prefix: str) -> ResourceLimits:
         if number > (most := LARGEST_LIMITS.get(name, LARGEST_LIMIT)):
             raise ConfigError(f"{what}: {name} can be {most:,} at most")
         typed[name] = int(number) if isinstance(getattr(usual, name), int) else number
-    return msgspec.structs.replace(usual, **typed)
+    return replace(usual, **typed)
 
 
 def cases_of(text: str) -> tuple[int, ...]:
@@ -272,34 +274,41 @@ class RunOptions(msgspec.Struct, frozen=True, kw_only=True):
             chosen[field] = value if name == "cpus" else int(value)
         return AgentLimits(**chosen)
 
-    def plan(
-        self, settings: RunSettings, started_in: Path, config: AgentConfig | None = None, **more: Any
-    ) -> Plan:
-        """The run with these settings. `config`: as for `texts`; `more`: of the plan. Raises ConfigError."""
-        known = config or harnesses.config_of(self.agent, started_in)
+    def plan(self, settings: RunSettings, started_in: Path, config: AgentConfig | None = None) -> Plan:
+        """The run with these settings. `config`: as for `texts`. Raises ConfigError."""
+        known, start_from = config or harnesses.config_of(self.agent, started_in), ""
         if self.start_from is not None:
             origin = find_start(self.start_from, started_in)
-            settings = msgspec.structs.replace(settings, start=origin.start)
-            more["start_from"] = f"{origin.folder.root}@{origin.submit}"
-        more |= {
-            name: getattr(self, name) for name in ("agent", "runs", "record_model", "overwrite", "resume")
-        }
+            settings = replace(settings, start=origin.start)
+            start_from = f"{origin.folder.root}@{origin.submit}"
         return Plan(
             settings=settings,
+            agent=self.agent,
+            runs=self.runs,
+            overwrite=self.overwrite,
+            resume=self.resume,
             config=config,
             prices=read_prices(self.prices, known, started_in),
             limits=self._agent_limits(),
             started_in=started_in,
             wall_limit_s=self.agent_wall_s,
             silence_s=self.agent_silence_s,
-            **more,
+            start_from=start_from,
+            record_model=self.record_model,
         )
 
-    def plans(self, env_ids: list[str], started_in: Path, agent_host: str = "", **more: Any) -> list[Plan]:
+    def plans(
+        self, env_ids: list[str], jail: JailSettings, agent_host: str = "", listener: Listener | None = None
+    ) -> list[Plan]:
         """A plan for each environment, named after it. ConfigError naming the option or file that is wrong."""
-        texts, exp_id = self.texts(started_in), self.exp_id or default_exp_id()
-        settings = {env: self.settings(env, exp_id, agent_host, texts) for env in env_ids}
-        return [self.plan(settings[env], started_in, name=env, texts=texts, **more) for env in env_ids]
+        if self.resume and (self.overwrite or self.exp_id is None):
+            raise ConfigError("--resume needs --exp-id, and cannot be combined with --overwrite")
+        started_in, exp_id = Path.cwd(), self.exp_id or default_exp_id()
+        texts = self.texts(started_in)
+        plans = [self.plan(self.settings(env, exp_id, agent_host, texts), started_in) for env in env_ids]
+        return [
+            replace(each, name=each.settings.env, texts=texts, jail=jail, listener=listener) for each in plans
+        ]
 
 
 _OTHERWISE = {"entry", "model", "exp_id", "profile", "agents_md", "prompts"}

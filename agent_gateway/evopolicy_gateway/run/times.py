@@ -38,10 +38,14 @@ class Times(msgspec.Struct, frozen=True, kw_only=True):
 
     def __add__(self, more: Times) -> Times:
         """With the seconds that another process has counted; waits are counted by the coordinator."""
-        counted = ("agent_s", "open_s", "in_flight_s", "feedback_s")
-        sums = {name: getattr(self, name) + getattr(more, name) for name in counted}
-        resources = more.resources.after(self.resources) if more.resources else self.resources
-        return msgspec.structs.replace(self, **sums, resources=resources)
+        return msgspec.structs.replace(
+            self,
+            agent_s=self.agent_s + more.agent_s,
+            open_s=self.open_s + more.open_s,
+            in_flight_s=self.in_flight_s + more.in_flight_s,
+            feedback_s=self.feedback_s + more.feedback_s,
+            resources=more.resources.after(self.resources) if more.resources else self.resources,
+        )
 
 
 Process = Literal["agent", "gateway"]
@@ -76,10 +80,9 @@ class Stopwatch:
     def begins(self, process: Process) -> None:
         self._base += self._reported.pop(process, Times())
 
-    def reported(self, process: Process, **counts: object) -> None:
-        """Sets counts of a present process; saves those of an agent."""
-        before = self._reported.get(process, Times())
-        self._reported[process] = msgspec.structs.replace(before, **counts)
+    def reported(self, process: Process, counts: Times) -> None:
+        """Sets the counts of a present process; saves those of an agent."""
+        self._reported[process] = counts
         if process == "agent":
             self.keep()
 

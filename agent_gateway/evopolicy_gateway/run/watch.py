@@ -71,8 +71,7 @@ class View(ABC):
         """Shows the table inside the `with` if the console is a terminal."""
         with contextlib.ExitStack() as stack:
             if self._drawn:
-                how: dict[str, Any] = {"refresh_per_second": 4, "transient": True}
-                stack.enter_context(Live(console=self._console, get_renderable=self.render, **how))
+                stack.enter_context(Live(console=self._console, get_renderable=self.render, transient=True))
             yield self
 
     @abstractmethod

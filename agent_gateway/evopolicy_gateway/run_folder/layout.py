@@ -79,10 +79,18 @@ class RunFolder(msgspec.Struct, frozen=True):
 
     def artifacts(self) -> Artifacts:
         """The existing files of a finished run, under their names in `run.json`."""
-        logs = {"logs_harness": self.harness_log, "logs_agent": self.agent_log, "logs_env": self.env_log}
-        places = {name: getattr(self, name) for name in ("workspace", "feedback", "checkpoints")} | logs
-        existing = {name: path for name, path in places.items() if path.exists()}
-        return Artifacts(**{name: path.relative_to(self.root).as_posix() for name, path in existing.items()})
+
+        def named(path: Path) -> str | None:
+            return path.relative_to(self.root).as_posix() if path.exists() else None
+
+        return Artifacts(
+            workspace=named(self.workspace),
+            feedback=named(self.feedback),
+            checkpoints=named(self.checkpoints),
+            logs_harness=named(self.harness_log),
+            logs_agent=named(self.agent_log),
+            logs_env=named(self.env_log),
+        )
 
     state = Place(open_run.STATE)
     """The gateway's own folder, while the run is open."""

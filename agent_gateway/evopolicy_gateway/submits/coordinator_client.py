@@ -13,7 +13,7 @@ import tempfile
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import Any, TypeVar, cast
+from typing import TypeVar, cast
 
 import msgspec
 
@@ -21,7 +21,6 @@ from evopolicy_common.errors import RefusedError, TransportError
 from evopolicy_common.logs import log
 from evopolicy_common.messages import gateway as messages
 from evopolicy_common.messages.episode import BlobRef
-from evopolicy_common.messages.worker import Message
 from evopolicy_common.refusals import NOT_NOW, RUN_LOST
 from evopolicy_common.wire import codec, keys
 from evopolicy_common.wire.requests import Requester
@@ -54,22 +53,19 @@ class CoordinatorClient:
         """`scratch`: folder of temporary files; None: the system's."""
         self._scratch = scratch
         self._sender = run, link.credentials.token
-        self._known: dict[str, Any] = {"run": run, "token": link.credentials.token}
         self._requests: Requester[messages.GatewayReply] = Requester(
             link, partial(keys.gateway_key, link.credentials.cluster, run), codec.gateway_replies
         )
 
     async def open(self) -> messages.RunOpened:
         """Opens the run; returns everything that is fixed for it, and its state."""
-        message = messages.OpenRun(**self._known, asks_permit=True)
-        return await self._ask("open", message, messages.RunOpened)
+        return await self._ask("open", messages.OpenRun(asks_permit=True), messages.RunOpened)
 
     async def permit(self, place: AgentPlace, on_wait: Callable[[str], None]) -> bool:
         """Returns True once the run's agent may be alive at `place`; calls `on_wait` with the reason while it waits."""
         wait_s = FIRST_PERMIT_WAIT_S
-        known = self._known | msgspec.structs.asdict(place)
         while True:
-            message = messages.RequestPermit(**known, wait_s=wait_s)
+            message = messages.RequestPermit(boot_id=place.boot_id, host=place.host, wait_s=wait_s)
             permit = await self._ask("permit", message, messages.Permit, wait_s=wait_s)
             if permit.granted:
                 return True
@@ -90,7 +86,7 @@ class CoordinatorClient:
     async def state(self) -> messages.RunState | None:
         """Returns the run's current state; None when the coordinator does not answer within a second, or has lost the
         run."""
-        question = messages.StateRequest(**self._known)
+        question = self._signed(messages.StateRequest())
         try:
             async with asyncio.timeout(STATE_TIMEOUT_S):
                 return (await self._requests.once("state", question, messages.StateReply)).state
@@ -107,13 +103,12 @@ class CoordinatorClient:
     async def submit(self, request: messages.Submit, after: int) -> messages.SubmitAccepted:
         """Requests an evaluation, as submit number `after`, from 0. The same request gets the same answer however often
         it is sent."""
-        message = msgspec.structs.replace(request, **self._known, after=after)
+        message = msgspec.structs.replace(request, after=after)
         return await self._ask("submit", message, messages.SubmitAccepted)
 
     async def results(self, submit_index: int, cursor: int, wait_s: float) -> messages.ResultsPage:
         """Returns the submit's results since `cursor`, within `wait_s` seconds; the page may be empty."""
-        asked: dict[str, Any] = {"submit_index": submit_index, "cursor": cursor, "wait_s": wait_s}
-        question = messages.ResultsRequest(**self._known, **asked)
+        question = messages.ResultsRequest(submit_index=submit_index, cursor=cursor, wait_s=wait_s)
         return await self._ask("results", question, messages.ResultsPage, wait_s=wait_s)
 
     async def ended(self, submit_index: int) -> None:
@@ -133,10 +128,16 @@ class CoordinatorClient:
     async def close(self, reason: str, agent: dict[str, object], after: int) -> None:
         """Closes the run to further submits than the `after` accepted ones. Call it only when the agent and all its
         children are gone."""
-        message = messages.CloseRun(**self._known, reason=reason, agent=agent, after=after)
+        message = messages.CloseRun(reason=reason, agent=agent, after=after)
         await self._ask("close", message, messages.RunClosed)
 
-    async def _ask(self, verb: str, message: Message, wanted: type[Wanted], *, wait_s: float = 0.0) -> Wanted:
+    def _signed(self, message: messages.FromGateway) -> messages.FromGateway:
+        run, token = self._sender
+        return msgspec.structs.replace(message, run=run, token=token)
+
+    async def _ask(
+        self, verb: str, message: messages.FromGateway, wanted: type[Wanted], *, wait_s: float = 0.0
+    ) -> Wanted:
         return await self._requests.until_answered(
-            verb, message, wanted, wait_s=wait_s, despite=NOT_NOW | RUN_LOST
+            verb, self._signed(message), wanted, wait_s=wait_s, despite=NOT_NOW | RUN_LOST
         )

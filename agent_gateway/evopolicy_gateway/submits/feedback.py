@@ -19,7 +19,6 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import msgspec
 
@@ -53,8 +52,7 @@ SHORTEST_LINGER_S = 0.002
 FETCHES_AT_ONCE = 4
 _NOT_WRITTEN = "this episode's trajectory cannot be written"
 _NOTHING = BlobRef(digest="", size=0)
-_WRITTEN: dict[str, Any] = {"trajectory": _NOTHING, "video": None, "stdout": b"", "stderr": b""}
-"""Fields of an episode whose files are written."""
+"""The trajectory of an episode whose files are written."""
 _Fetched = tuple[bytes, bytes | None] | str
 """The bytes of an episode's trajectory and video, or why they are missing."""
 _much = threading.Lock()
@@ -199,7 +197,9 @@ class Collector:
                 fetched = [(episode, await self._fetch(episode)) for episode in episodes]
                 await asyncio.to_thread(self._put, fetched)
                 for episode in episodes:
-                    self.scores[episode.index] = msgspec.structs.replace(episode, **_WRITTEN)
+                    self.scores[episode.index] = msgspec.structs.replace(
+                        episode, trajectory=_NOTHING, video=None, stdout=b"", stderr=b""
+                    )
 
         # All writes end before an error is raised: none may write into a tree that is started over.
         writes = [write(whole), *(write([episode]) for episode in others)]

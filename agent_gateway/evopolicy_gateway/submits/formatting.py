@@ -45,10 +45,10 @@ def failure_text(failure: PolicyFailure | None) -> str | None:
 
 def failure_line(failure: PolicyFailure, at: float) -> bytes:
     """A failure as a line of an episode's `error.txt`, cut to 64 KiB. `at`: Unix time, seconds."""
-    more: dict[str, Any] = {"step_index": failure.step_index}
+    more: dict[str, object] = {"step_index": failure.step_index}
     if failure.limit is not None:
         more |= {"limit": failure.limit, "used": failure.used}
-    return _line(at, failure.category, failure.message, failure.traceback, **more)
+    return _line(at, failure.category, failure.message, failure.traceback, more)
 
 
 def verdict_line(status: str, failure: PolicyFailure | None, at: float, *, traceback: bool = True) -> bytes:
@@ -62,7 +62,7 @@ def verdict_line(status: str, failure: PolicyFailure | None, at: float, *, trace
         same = failure.category == status or failure.category in NO_POLICY
         own = failure.message if same else f"{failure.category}: {failure.message}"
         details = failure.traceback
-    return _line(at, status, own, details if traceback else None)
+    return _line(at, status, own, details if traceback else None, {})
 
 
 def summary_bytes(
@@ -161,10 +161,10 @@ def _where(scores: Sequence[EpisodeFeedback], categories: frozenset[str] | None)
     )
 
 
-def _line(at: float, category: str, message: str, traceback: str | None, **more: object) -> bytes:
+def _line(at: float, category: str, message: str, traceback: str | None, more: dict[str, object]) -> bytes:
     """A line of JSON; to fit 64 KiB its traceback (from the start) and then its message are cut."""
     line: dict[str, Any] = {"schema_version": SCHEMA_VERSION, "timestamp": utc_text(at), "category": category}
-    line |= {"message": message, "traceback": traceback, **more}
+    line |= {"message": message, "traceback": traceback} | more
     for field in ("traceback", "message"):
         text = line[field] or ""
         keep = len(text)

@@ -245,8 +245,9 @@ class TicketMachine:
         return Send() if self.in_flight.accepted is None else Collect()
 
     def snapshotted(self, snapshot: Snapshot) -> Note:
-        request, more = self._open.request, {"bundle_error": snapshot.error, "tree": snapshot.tree}
-        submit = msgspec.structs.replace(request.submit, bundle=snapshot.digest, **more)
+        request = self._open.request
+        why, tree = snapshot.error, snapshot.tree
+        submit = msgspec.structs.replace(request.submit, bundle=snapshot.digest, bundle_error=why, tree=tree)
         return Note(msgspec.structs.replace(request, submit=submit, kept=snapshot.kept))
 
     def sent(self, reply: SubmitAccepted) -> Note:

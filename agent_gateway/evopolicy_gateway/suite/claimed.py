@@ -25,14 +25,16 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
+from msgspec.structs import replace
 
 from evopolicy_common.errors import EvopolicyError, StorageError
 from evopolicy_common.local.cluster import unless_failed
-from evopolicy_common.messages.operator import ClaimState
+from evopolicy_common.messages.operator import Claim, ClaimState
 from evopolicy_common.processes.scratch import remove_tree
 from evopolicy_common.records.blobs import write_atomically
 from evopolicy_common.records.run_files import read_record
 from evopolicy_common.records.suite_folder import FINISHED, INDEX, PAUSED, Index, SweepRun
+from evopolicy_common.wire.credentials import Credentials
 from evopolicy_gateway.harnesses.coding_agents import session
 from evopolicy_gateway.processes.child_messages import AgentDoing
 from evopolicy_gateway.run.operations import Operations
@@ -56,11 +58,13 @@ class ClaimedSweep(Sweep):
 
     leaves = "all"
 
-    def __init__(self, suite: SuiteFile, root: Path, index: Index, *known: Any) -> None:
-        """`known`: the further arguments of `Sweep`; its view is a `SuiteView`."""
+    def __init__(
+        self, suite: SuiteFile, root: Path, index: Index, *known: *tuple[Operations, Credentials, SuiteView]
+    ) -> None:
+        """`known`: the further arguments of `Sweep`."""
         super().__init__(suite.parallel, index, *known)
         self._suite = suite
-        self._view: SuiteView = known[-1]
+        self._view = known[-1]
         self._root = root.absolute()
         self._host = socket.gethostname()
         # A host is a machine and a folder: two sweeps of one machine in different folders are two hosts, and so are
@@ -159,8 +163,9 @@ class ClaimedSweep(Sweep):
 
     def _begun(self, decision: Decision) -> SweepRun:
         settings = msgspec.to_builtins(decision.run.defining)
-        used = self._used_before(decision)
-        return msgspec.structs.replace(super()._begun(decision), host=self._host, settings=settings, **used)
+        tokens, earlier = self._used_before(decision)
+        begun = super()._begun(decision)
+        return replace(begun, host=self._host, settings=settings, tokens=tokens, earlier=earlier)
 
     async def _play(self, decision: Decision) -> None:
         await super()._play(decision)
@@ -174,15 +179,15 @@ class ClaimedSweep(Sweep):
         if decision.kind == "finish":
             await self._check_held(run, "another host has it now: its files are not written here")
         self._view.started(run.name, decision.attempt)
-        settings = msgspec.structs.replace(run.settings, attempt=decision.attempt)
+        settings = replace(run.settings, attempt=decision.attempt)
         is_new = decision.kind in ("restart", "new")
         aside = partial(self._put_aside, run.folder, decision.attempt - 1) if is_new else None
-        plan = msgspec.structs.replace(run, settings=settings, overwrite=is_new)
+        plan = replace(run, settings=settings, overwrite=is_new)
         record = await self._played(decision, plan, aside)
         if record.outcome.status == "cancelled":
             await self._check_held(run, "another host has it now and has cancelled it here")
-        known = {"settings": begun.settings, "earlier": begun.earlier}
-        return suite_index.entry_of(run, record, host=self._host, run=self._run_of(run), **known)
+        entry = replace(suite_index.entry_of(run, record), host=self._host, run=self._run_of(run))
+        return replace(entry, settings=begun.settings, earlier=begun.earlier)
 
     async def _check_held(self, run: Plan, otherwise: str) -> None:
         """Ends the run here, with a note, if another host has taken its claim."""
@@ -223,10 +228,10 @@ class ClaimedSweep(Sweep):
         self, run: Plan, ttl_s: float | None = None, result: dict[str, object] | None = None
     ) -> ClaimState:
         # By its digest, a run with other settings is another run, and an earlier result does not count for it.
-        name = f"{run.name}@{run.digest}"
+        name, holder, ours = f"{run.name}@{run.digest}", self._holder, self._run_of(run)
         ttl_s = self._limits.claim_ttl_s if ttl_s is None else ttl_s
-        known = (self._suite.name, name, self._holder, ttl_s, self._run_of(run), result)
-        claim = await self._operations.claim(*known)
+        wanted = Claim(suite=self._suite.name, name=name, holder=holder, ttl_s=ttl_s, run=ours, result=result)
+        claim = await self._operations.claim(wanted)
         self._coordinator = claim.coordinator
         self._told = self._told or claim.coordinator
         return claim
@@ -261,7 +266,7 @@ class ClaimedSweep(Sweep):
     def _anew(self, name: str) -> Decision:
         """The new decision for a run that another host has taken over meanwhile: a restart as a new attempt."""
         before = self._decided[name]
-        self._decided[name] = msgspec.structs.replace(before, kind="restart", attempt=before.attempt + 1)
+        self._decided[name] = replace(before, kind="restart", attempt=before.attempt + 1)
         return self._decided[name]
 
     def _named(self, holder: str) -> str:
@@ -273,20 +278,20 @@ class ClaimedSweep(Sweep):
         play = self._plays.get(run.name)
         return "" if play is None else play.run
 
-    def _used_before(self, decision: Decision) -> dict[str, Any]:
+    def _used_before(self, decision: Decision) -> tuple[dict[str, Any] | None, dict[str, Any] | None]:
         """Tokens used before: by the resumed run itself, and by its earlier attempts."""
         entry = self._index.runs.get(decision.run.name)
         if entry is None:
-            return {}
+            return None, None
         if decision.kind in ("resume", "finish"):
-            return {"tokens": entry.tokens, "earlier": entry.earlier}
-        return {"earlier": suite_index.added(entry.earlier, entry.tokens)}
+            return entry.tokens, entry.earlier
+        return None, suite_index.added(entry.earlier, entry.tokens)
 
     def _on_doing(self, name: str, doing: AgentDoing) -> None:
         entry = self._index.runs.get(name)
         if entry is not None and doing.tokens is not None:
             # Saved with the next renewal: a stream may report tokens many times a second.
-            self._index.runs[name] = msgspec.structs.replace(entry, tokens=doing.tokens)
+            self._index.runs[name] = replace(entry, tokens=doing.tokens)
             self._unsaved = True
         if doing.provider:
             self._paused_until[doing.provider] = time.monotonic() + doing.paused_s
@@ -348,8 +353,8 @@ async def facts_of(run: Plan, index: Index, operations: Operations) -> Facts:
         has_session = harness.continues or (
             harness.resumable and session.load(folder.session).session is not None
         )
-        known: dict[str, Any] = {"phase": phase, "has_session": has_session}
-        return Facts(entry=entry, opened=True, closing=folder.closing.exists(), **known)
+        closing = folder.closing.exists()
+        return Facts(entry=entry, opened=True, phase=phase, closing=closing, has_session=has_session)
     intended = run.intended()
-    settings = msgspec.structs.replace(run.settings, attempt=1 if entry is None else entry.attempt)
+    settings = replace(run.settings, attempt=1 if entry is None else entry.attempt)
     return Facts(entry=entry, intended=intended is not None and intended.settings == settings)

@@ -17,7 +17,6 @@ from evopolicy_common.records.suite_folder import Index, SweepRun
 from evopolicy_common.records.words import in_words
 from evopolicy_common.terminal import number
 from evopolicy_gateway.operator.cluster import Cluster, connected
-from evopolicy_gateway.run.lifecycle import Leaves
 from evopolicy_gateway.run.plan import Plan
 from evopolicy_gateway.run.watch import RunView
 from evopolicy_gateway.suite.decisions import Decision
@@ -40,22 +39,18 @@ class PlayedRuns(msgspec.Struct, frozen=True):
 
 
 class _Runs(Sweep):
-    def __init__(self, played: PlayedRuns, parallel: int, leaves: Leaves, *known: Any) -> None:
-        """`known`: the further arguments of `Sweep`."""
-        super().__init__(Parallel(machine=parallel), played.index, *known)
-        self.leaves = leaves
-        self._results = played
+    results: PlayedRuns
 
     async def _record(self, decision: Decision, begun: SweepRun) -> SweepRun:
         run = decision.run
-        record = self._results.records[run.name] = await self._played(decision, run)
+        record = self.results.records[run.name] = await self._played(decision, run)
+        entry, outcome = entry_of(run, record), record.outcome
         # Unlike a suite, this never repeats a run whose agent did not play, so the run keeps its own status.
-        own = {"state": record.outcome.status, "error": record.outcome.error}
-        return msgspec.structs.replace(entry_of(run, record), **own)
+        return msgspec.structs.replace(entry, state=outcome.status, error=outcome.error)
 
     def _why(self, run: Plan, error: Exception) -> str:
         if isinstance(error, ConfigError) and run.name not in self._scored:
-            self._results.wrong.add(run.name)
+            self.results.wrong.add(run.name)
             return str(error)
         why = super()._why(run, error)
         self._watch.note(run.name, f"failed: {why}")
@@ -74,9 +69,10 @@ async def play_plans(plans: Sequence[Plan], where: Cluster, parallel: int, conso
         where.check_cases(settings)
         wanted = [one.env for one in settings], {one.sandbox_tier for one in settings}
         async with connected(where, *wanted) as (operations, gateway, failed):
+            runs = _Runs(Parallel(machine=parallel), played.index, operations, gateway, watch)
             # A temporary cluster takes its runs with it.
-            leaves: Leaves = "nothing" if where.local is not None and where.local.state is None else "ended"
-            runs = _Runs(played, parallel, leaves, operations, gateway, watch)
+            runs.leaves = "nothing" if where.local is not None and where.local.state is None else "ended"
+            runs.results = played
             await unless_failed(asyncio.create_task(runs.play_runs(decided)), failed)
     if played.wrong == set(played.index.runs):
         raise ConfigError(played.index.runs[plans[0].name].error or "")

@@ -156,7 +156,7 @@ def _explained(problem: str, text: str) -> str:
         n for n, line in enumerate(text.splitlines(), 1) if re.match(rf"\s*\W*{re.escape(key)}\b", line)
     ]
     place = f", line {numbers[0]}" if len(numbers) == 1 else ""
-    known: dict[str, tuple[Any, str]] = {}
+    known: dict[str, tuple[object, str]] = {}
     for table, where in _TABLES.items():
         for field in msgspec.structs.fields(table):
             known.setdefault(field.encode_name, (field.type, where))
@@ -273,11 +273,10 @@ def _plan(
         | {"limits": limits_from(table.get("limits", {}), "limits.")},
     )
     agent_texts = given.texts(started_in, config)
-    return given.plan(
-        given.settings(env, given.exp_id or "", texts=agent_texts, suite=suite.name),
-        started_in,
+    settings = given.settings(env, given.exp_id or "", texts=agent_texts, suite=suite.name)
+    return msgspec.structs.replace(
+        given.plan(settings, started_in, config),
         name=f"{agent.name}/{env}/{repeat}",
-        config=config,
         texts=agent_texts,
         parallel=agent.parallel,
         jail=agent.jail,

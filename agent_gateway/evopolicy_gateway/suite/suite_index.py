@@ -61,7 +61,7 @@ def directory_of(run: Plan) -> str:
     return str(run.folder.root.relative_to(run.runs.absolute()))
 
 
-def entry_of(plan: Plan, record: RunRecord, **more: object) -> SweepRun:
+def entry_of(plan: Plan, record: RunRecord) -> SweepRun:
     outcome, state, tokens = record.outcome, state_of(record), record.agent.tokens
     use = record.agent.model_use
     requests = {"requests": 0 if use is None else use.requests or 0}
@@ -79,7 +79,6 @@ def entry_of(plan: Plan, record: RunRecord, **more: object) -> SweepRun:
         error=outcome.error or (_NO_RUN if state == "error" else None),
         wall_s=record.timing.wall_time_seconds,
         finished_at=record.timing.end_time,
-        **more,
     )
 
 

@@ -29,7 +29,6 @@ _TITLES = ("run", *_WIDTHS)
 _ORDER = ("state", "budget", "best mean", "last action", "submits", "tokens")
 """Columns beside the name, the most important first."""
 _LEAST_NAME, _LEAST_STATE, _GAP = 16, 14, 2
-_CUT: dict[str, Any] = {"no_wrap": True, "overflow": "ellipsis"}
 _ENDED_OTHERWISE = {"error": "failed", "cancelled": "cancelled"}
 _STYLES = ("bold", "red", "dim", "dim", "")
 """Styles of rows by `_order`: running, failed, on another host, waiting, ended."""
@@ -63,8 +62,9 @@ class SuiteView(View):
         row = self.rows[name]
         row.state, row.entry, row.action = entry.state, entry, ""
         row.tokens = entry.tokens or row.tokens
-        known = {"state": entry.state, "score": entry.score, "random": entry.random}
-        self.event("finished", name, **known, error=entry.error)
+        self.event(
+            "finished", name, state=entry.state, score=entry.score, random=entry.random, error=entry.error
+        )
 
     def elsewhere(self, name: str, host: str) -> None:
         self.rows[name].state = f"on {host}"
@@ -153,8 +153,8 @@ class SuiteView(View):
         columns = _columns(self._console.width, max((len(name) for name, _ in shown), default=0))
         for title, width in columns.items():
             # A run's name is never cut: `--only` takes it.
-            how: dict[str, Any] = {"overflow": "fold"} if title == "run" else _CUT
-            table.add_column(title, width=width, **how)
+            cut = title != "run"
+            table.add_column(title, width=width, no_wrap=cut, overflow="ellipsis" if cut else "fold")
         for name, row in shown:
             cells = dict(zip(_TITLES, (name, *_cells(row)), strict=True))
             table.add_row(*(Text(cells[title], _STYLES[_order(row)]) for title in columns))

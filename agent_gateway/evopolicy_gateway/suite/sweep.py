@@ -12,7 +12,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from functools import partial
 
-import msgspec
+from msgspec.structs import replace
 
 from evopolicy_common.records.run_record import RunRecord
 from evopolicy_common.records.suite_folder import Index, SweepRun
@@ -109,8 +109,8 @@ class Sweep(ABC):
         self._index.runs[entry.name] = entry
 
     def _begun(self, decision: Decision) -> SweepRun:
-        run, now = decision.run, {"state": "running", "attempt": decision.attempt}
-        return msgspec.structs.replace(waiting(run), **now, directory=directory_of(run))
+        run, attempt = decision.run, decision.attempt
+        return replace(waiting(run), state="running", attempt=attempt, directory=directory_of(run))
 
     def _why(self, run: Plan, error: Exception) -> str:
         return why_failed(error, run.folder.harness_log)
@@ -167,15 +167,15 @@ class Sweep(ABC):
             except Exception as error:
                 tokens, why = self._index.runs[begun.name].tokens, self._why(decision.run, error)
                 if begun.name in self._scored and pauses:
-                    decision = msgspec.structs.replace(decision, kind="finish")
+                    decision = replace(decision, kind="finish")
                     await asyncio.sleep(pauses.pop(0))
                 else:
-                    done = msgspec.structs.replace(begun, state="error", error=why, tokens=tokens)
+                    done = replace(begun, state="error", error=why, tokens=tokens)
                     play = self._plays.get(begun.name)
                     if before is not None and (play is None or not play.run):
                         # The folder still holds the earlier run, if there was one.
-                        known = {name: getattr(before, name) for name in ("digest", "settings", "attempt")}
-                        done = msgspec.structs.replace(done, **known)
+                        done = replace(done, digest=before.digest, attempt=before.attempt)
+                        done = replace(done, settings=before.settings)
             finally:
                 self._plays.pop(begun.name, None)
         self._put(done)
@@ -183,8 +183,7 @@ class Sweep(ABC):
     async def _played(
         self, decision: Decision, plan: Plan, put_aside: Callable[[], None] | None = None
     ) -> RunRecord:
-        known = (plan, self._operations, self._gateway, self._watch)
         gone = partial(self._agent_gone, plan.name)
-        play = RunLifecycle(*known, leaves=self.leaves, on_agent_gone=gone)
+        play = RunLifecycle(plan, self._operations, self._gateway, self._watch, self.leaves, gone)
         self._plays[plan.name] = play
         return await (play.go_on() if decision.kind in ("resume", "finish") else play.play_run(put_aside))

@@ -5,6 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+from msgspec.structs import replace
+
 from evopolicy_common.messages.episode import BlobRef
 from evopolicy_common.messages.gateway import EpisodeFeedback
 from evopolicy_common.messages.operator import Committed, CreateRun, RunFinished, SubmitResult
@@ -14,7 +16,8 @@ from evopolicy_common.records.account import run_record
 from evopolicy_common.records.run_record import RunRecord
 from evopolicy_gateway.run.plan import Plan
 from evopolicy_gateway.run.record import claims
-from evopolicy_gateway.run_folder.layout import RunFolder, save
+from evopolicy_gateway.run.times import Times
+from evopolicy_gateway.run_folder.layout import RunFolder, Staged, save
 
 SETTINGS = RunSettings(env="toy/line", entry="evolve", model="none", exp_id="t", budget=8)
 
@@ -64,6 +67,8 @@ def finished(**fields: Any) -> RunFinished:
     return RunFinished(**usual | fields)
 
 
-def record_in(plan: Plan, done: RunFinished, **more: Any) -> RunRecord:
-    """The record of a run that the plan's command has played. `more`: of `claims`."""
-    return run_record(done, claims(plan, done.agent, **more))
+def record_in(
+    plan: Plan, done: RunFinished, staged: Staged | None = None, times: Times | None = None, **more: Any
+) -> RunRecord:
+    """The record of a run that the plan's command has played. `more`: of its `Claims`."""
+    return run_record(done, replace(claims(plan, done.agent, staged, times or Times()), **more))

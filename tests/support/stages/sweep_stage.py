@@ -14,7 +14,7 @@ import pytest
 from rigs.finished_run import finished, plan_in, record_in
 
 from evopolicy_common.console import Terminal
-from evopolicy_common.messages.operator import ClaimState
+from evopolicy_common.messages.operator import Claim, ClaimState
 from evopolicy_common.messages.run_settings import RunSettings
 from evopolicy_common.records.run_record import RunRecord
 from evopolicy_common.records.suite_folder import Index, SweepRun
@@ -50,12 +50,10 @@ class Cluster:
         self.phase: str | None = "open"
         self.answer: Callable[[str], ClaimState | None] = lambda name: None
 
-    async def claim(
-        self, suite: str, name: str, holder: str, ttl_s: float, run: str, result: dict[str, Any] | None
-    ) -> ClaimState:
-        plain = name.partition("@")[0]
-        self.reports.append((plain, run, result))
-        return self.answer(plain) or ClaimState(granted=True, holder=holder, run="")
+    async def claim(self, wanted: Claim) -> ClaimState:
+        plain = wanted.name.partition("@")[0]
+        self.reports.append((plain, wanted.run, wanted.result))
+        return self.answer(plain) or ClaimState(granted=True, holder=wanted.holder, run="")
 
     async def cancel(self, run: str) -> None:
         self.cancelled.append(run)
@@ -93,7 +91,6 @@ class Lifecycle:
         operations: object,
         gateway: object,
         watch: object,
-        *,
         leaves: str,
         on_agent_gone: Callable[[], None],
     ) -> None:

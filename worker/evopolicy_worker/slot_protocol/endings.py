@@ -76,23 +76,22 @@ class Row(NamedTuple):
         return known and (self.how is None or ending.how in self.how)
 
 
-_CODE: dict[str, bool] = {"limit": False, "began": True}
-"""Of a policy whose code has begun, where no limit explains the ending."""
 _KILLED: tuple[How, ...] = ("SIGKILL", "stop")
 _CRASH: tuple[How, ...] = ("exit", "fault")
 _FROM_OUTSIDE: tuple[How, ...] = (*_KILLED, "signal", "pipe", "frame")
 _SEALED = "killed or stopped, sealed, and no limit explains it"
+_OPEN = "killed or stopped where it can signal itself"
 _OVERRAN_AGAIN = "the environment overran on its actions, as in earlier attempts"
 TABLE: tuple[Row, ...] = (
     Row("a policy's process before the bundle's code", "policy", None, "outside", began=False),
     Row("a limit was passed", "policy", None, "limit", limit=True, began=True),
-    Row("it exited", "policy", ("exit",), "killed", **_CODE),
-    Row("it crashed", "policy", ("fault",), "killed", **_CODE),
-    Row("a signal that it can send itself", "policy", ("signal",), "killed", **_CODE),
-    Row("it closed its pipe", "policy", ("pipe",), "killed", **_CODE),
-    Row("it broke the pipes' rules", "policy", ("frame",), "killed", **_CODE),
-    Row("killed or stopped where it can signal itself", "policy", _KILLED, "killed", **_CODE, held=False),
-    Row(_SEALED, "policy", _KILLED, "outside", **_CODE, held=True),
+    Row("it exited", "policy", ("exit",), "killed", limit=False, began=True),
+    Row("it crashed", "policy", ("fault",), "killed", limit=False, began=True),
+    Row("a signal that it can send itself", "policy", ("signal",), "killed", limit=False, began=True),
+    Row("it closed its pipe", "policy", ("pipe",), "killed", limit=False, began=True),
+    Row("it broke the pipes' rules", "policy", ("frame",), "killed", limit=False, began=True),
+    Row(_OPEN, "policy", _KILLED, "killed", limit=False, began=True, held=False),
+    Row(_SEALED, "policy", _KILLED, "outside", limit=False, began=True, held=True),
     Row("bubblewrap or the zygote", "sandbox", None, "outside"),
     Row("the environment crashed on its actions", "environment", _CRASH, "killed", began=True),
     Row("the environment crashed before any", "environment", _CRASH, "outside", began=False),

@@ -32,7 +32,6 @@ from collections import deque
 from collections.abc import Callable, Collection, Sequence
 from functools import cache
 from pathlib import Path
-from typing import Any
 
 import msgspec
 
@@ -146,9 +145,11 @@ class Slot:
         command = env_jail.command(
             start.tier, self._scratch, draws=start.draws, definitions=start.definitions
         )
-        options: dict[str, Any] = {"env": env_jail.variables(self._scratch), "start_new_session": True}
-        options |= {"stdin": pipe, "stdout": pipe, "stderr": pipe, "limit": 1 << 20}
-        starting = asyncio.ensure_future(asyncio.create_subprocess_exec(*command, **options))
+        own, limit = env_jail.variables(self._scratch), 1 << 20
+        made = asyncio.create_subprocess_exec(
+            *command, stdin=pipe, stdout=pipe, stderr=pipe, limit=limit, env=own, start_new_session=True
+        )
+        starting = asyncio.ensure_future(made)
         try:
             self._process = await asyncio.shield(starting)
         except asyncio.CancelledError:

@@ -11,7 +11,7 @@ import json
 import re
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -273,19 +273,19 @@ def _call(identity: str, name: str, arguments: object) -> Call:
     """A call as the model wrote it, which may be anything."""
     said = _decoded(arguments)
     given = said if isinstance(said, dict) else {"text": str(said)}
-    known: dict[str, Any] = {"id": identity, "name": name, "given": given}
+    call = Call(id=identity, name=name, given=given)
     if name != shell.NAME:
-        return Call(**known, fault=f"there is no tool {name!r}; the only one is {shell.NAME}")
+        return replace(call, fault=f"there is no tool {name!r}; the only one is {shell.NAME}")
     if said is not given:
-        return Call(**known, fault="the arguments are not a JSON object; give one with `command`")
+        return replace(call, fault="the arguments are not a JSON object; give one with `command`")
     try:
         command, timeout_s = given["command"], float(given.get("timeout_s") or shell.USUAL_S)
     except (ValueError, TypeError, KeyError) as error:
         why = f"the arguments cannot be read ({error!r}); give a JSON object with `command`"
-        return Call(**known, fault=why)
+        return replace(call, fault=why)
     if not isinstance(command, str) or not 0.0 < timeout_s < float("inf"):
-        return Call(**known, fault="`command` must be a text, and `timeout_s` a number above zero")
-    return Call(**known, command=command, timeout_s=min(timeout_s, shell.MOST_S))
+        return replace(call, fault="`command` must be a text, and `timeout_s` a number above zero")
+    return replace(call, command=command, timeout_s=min(timeout_s, shell.MOST_S))
 
 
 def _decoded(arguments: object) -> Any:

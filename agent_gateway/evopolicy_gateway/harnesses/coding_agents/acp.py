@@ -153,12 +153,12 @@ class AcpAgent(CliAgent):
             await link.choose(modes, mode)
         elif mode:
             await link.request("session_set_mode", {"sessionId": link.session, "modeId": mode})
-        words = (*self._program, *self._config.extra_args, *self._config.environment.values())
-        for name, category in (("model", "model"), ("effort", "thought_level")):
-            value = getattr(self._config, name)
+        config = self._config
+        words = (*self._program, *config.extra_args, *config.environment.values())
+        for name, value in (("model", config.model), ("effort", config.effort)):
             if value is None:
                 continue
-            choice = offered_choice(answer, category)
+            choice = offered_choice(answer, "model" if name == "model" else "thought_level")
             started_with_it = any(value in word for word in words)
             if choice is not None and (value in choice.values or not started_with_it):
                 await link.choose(choice, value)

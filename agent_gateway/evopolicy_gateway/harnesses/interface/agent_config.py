@@ -279,9 +279,10 @@ class AgentConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
             raise ConfigError('models = "declared" needs `model`')
         if self.api is not None:
             self.api.check()
-        for name in ("backoff_s", "silence_s", "pause_s"):
-            if not 0.0 < getattr(self, name) < float("inf"):
-                raise ConfigError(f"{name} = {getattr(self, name)}: must be a number of seconds above 0")
+        pauses = {"backoff_s": self.backoff_s, "silence_s": self.silence_s, "pause_s": self.pause_s}
+        for name, value in pauses.items():
+            if not 0.0 < value < float("inf"):
+                raise ConfigError(f"{name} = {value}: must be a number of seconds above 0")
         if self.retries < 0 or self.reprompts < 0:
             raise ConfigError("retries and reprompts must be at least 0")
         if self.prompts is not None:

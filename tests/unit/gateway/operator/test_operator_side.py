@@ -70,8 +70,8 @@ def test_a_completed_run_is_recorded_with_all_its_numbers(tmp_path: Path) -> Non
     rejected = [RejectedSubmit(status="budget_invalid", message="no", after_submits=1)]
     times = Times(open_s=9.0, in_flight_s=4.0, feedback_s=0.5)
     counted = {"steps": 10, "action_invalid": 3}
-    known: dict[str, Any] = {"staged": STAGED, "rejected": rejected, "times": times, "transitions": counted}
-    record = record_in(plan_in(tmp_path), finished(), **known)
+    known = {"rejected_submits": tuple(rejected), "transitions": counted}
+    record = record_in(plan_in(tmp_path), finished(), STAGED, times, **known)
     assert record.outcome.auxiliary["transitions"] == {"steps": 10, "action_invalid": 3}
     assert decode_run_record(encode_run_record(record)) == record
     assert record.outcome.final_score == record.outcome.heldout_mean_return == 2.0

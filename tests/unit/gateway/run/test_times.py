@@ -15,15 +15,15 @@ def test_reported_times_add_up_over_deaths_and_commands(tmp_path: Path) -> None:
     first.opened()
     first.begins("gateway")
     first.begins("agent")
-    first.reported("gateway", in_flight_s=2.0, feedback_s=0.5)
-    first.reported("agent", agent_s=5.0)
+    first.reported("gateway", Times(in_flight_s=2.0, feedback_s=0.5))
+    first.reported("agent", Times(agent_s=5.0))
     # The second agent supervisor and the second gateway tell more than the first did, and still do not take its place.
     first.begins("agent")
-    first.reported("agent", agent_s=6.0)
+    first.reported("agent", Times(agent_s=6.0))
     first.begins("gateway")
-    first.reported("gateway", in_flight_s=3.0, feedback_s=0.75)
+    first.reported("gateway", Times(in_flight_s=3.0, feedback_s=0.75))
     now[0] = 120.0
-    first.reported("agent", agent_s=7.0)
+    first.reported("agent", Times(agent_s=7.0))
     whole = Times(agent_s=12.0, open_s=20.0, in_flight_s=5.0, feedback_s=1.25)
     assert first.times == whole
     # This command is killed here; what it told last is on disk.
@@ -31,7 +31,7 @@ def test_reported_times_add_up_over_deaths_and_commands(tmp_path: Path) -> None:
     assert second.times == whole
     second.opened()
     second.begins("agent")
-    second.reported("agent", agent_s=1.0)
+    second.reported("agent", Times(agent_s=1.0))
     now[0] = 121.0
     second.closed()
     now[0] = 500.0
@@ -64,17 +64,12 @@ def test_resources_of_killed_and_resumed_agents_add_up(tmp_path: Path) -> None:
     limits = AgentLimits(pids=9)
     for cpu_s, peak in ((1.0, 50), (2.0, 70)):
         first.begins("agent")
-        first.reported("agent", resources=AgentResources(limits=limits, cpu_s=cpu_s / 2))
-        first.reported(
-            "agent",
-            resources=AgentResources(
-                limits=limits, cpu_s=cpu_s, memory_peak_bytes=peak, disk_bytes=100 - peak
-            ),
-        )
-    first.reported("agent", agent_s=1.0)
+        first.reported("agent", Times(resources=AgentResources(limits=limits, cpu_s=cpu_s / 2)))
+        resources = AgentResources(limits=limits, cpu_s=cpu_s, memory_peak_bytes=peak, disk_bytes=100 - peak)
+        first.reported("agent", Times(agent_s=1.0, resources=resources))
     second = Stopwatch(path)  # the command is killed here
     second.begins("agent")
-    second.reported("agent", resources=AgentResources(limits=limits, cpu_s=0.5, refused_forks=3))
+    second.reported("agent", Times(resources=AgentResources(limits=limits, cpu_s=0.5, refused_forks=3)))
     second.closed()
     whole = AgentResources(limits=limits, cpu_s=3.5, memory_peak_bytes=70, disk_bytes=50, refused_forks=3)
     assert second.times.resources == Stopwatch(path).times.resources == whole

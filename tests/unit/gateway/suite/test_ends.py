@@ -53,12 +53,13 @@ def one_run(root: Path, **fields: Any) -> tuple[Plan, RunRecord]:
     (plan,) = expand(read_suite(str(path)), root / "runs", root)
     for index in range(3):
         (plan.folder.checkpoints / f"submit_{index:03d}").mkdir(parents=True)
-    return plan, record_in(plan, finished(settings=plan.settings, **fields), times=Times(open_s=9.0))
+    return plan, record_in(plan, finished(settings=plan.settings, **fields), None, Times(open_s=9.0))
 
 
 def test_the_index_keeps_its_bytes(tmp_path: Path) -> None:
     plan, record = one_run(tmp_path)
-    entry = entry_of(plan, record, settings=msgspec.to_builtins(plan.defining), host="h", run="r")
+    settings = msgspec.to_builtins(plan.defining)
+    entry = msgspec.structs.replace(entry_of(plan, record), settings=settings, host="h", run="r")
     index = Index(suite="s", runs={plan.name: entry})
     assert msgspec.json.format(msgspec.json.encode(index), indent=2).decode() == GOLDEN_INDEX
     (tmp_path / "suite.json").write_text(GOLDEN_INDEX)
