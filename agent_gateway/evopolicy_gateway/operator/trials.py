@@ -83,9 +83,7 @@ class TrialResult(msgspec.Struct, frozen=True, kw_only=True):
 
 async def try_policy(bundle: Bundle, message: Evaluate, out: Path, where: Cluster, *, as_json: bool) -> int:
     """Plays the policy on train cases and prints the results; returns 1 if it failed in an episode, else 0.
-
-    `message`: of `evaluation`; `out`: folder for trajectories.
-    """
+    `message`: of `evaluation`; `out`: folder for trajectories."""
     check_writable(out, "--out")
     console = terminal(stderr=as_json)
     notes: set[str] = set()
@@ -191,16 +189,6 @@ def _print(result: TrialResult, as_json: bool, console: Terminal) -> None:
     if as_json:
         say_json([result])
         return
-    _print_episodes(result, console)
-    if result.other_cases_next_time:
-        console.print(
-            "note: this cluster's cases end with it, the next call has others under the same ids;"
-            " leave out --fresh, or give --data DIR or --connect, to keep them the same",
-            soft_wrap=True,
-        )
-
-
-def _print_episodes(result: TrialResult, console: Terminal) -> None:
     numbers = ("case", "return", "steps")
     made = table(*numbers, "played by", "failure", right=numbers)
     for one in result.episodes:
@@ -209,6 +197,12 @@ def _print_episodes(result: TrialResult, console: Terminal) -> None:
     console.print(made)
     console.print(_summary(result), soft_wrap=True)
     console.print(f"trajectories and errors: {result.folder}", soft_wrap=True)
+    if result.other_cases_next_time:
+        console.print(
+            "note: this cluster's cases end with it, the next call has others under the same ids;"
+            " leave out --fresh, or give --data DIR or --connect, to keep them the same",
+            soft_wrap=True,
+        )
 
 
 def _summary(result: TrialResult) -> str:
