@@ -8,6 +8,7 @@ import random
 import time
 import uuid
 from collections.abc import AsyncIterator, Callable, Mapping, Sequence
+from typing import NamedTuple
 
 import msgspec
 
@@ -47,6 +48,17 @@ class Cases(msgspec.Struct, frozen=True, kw_only=True):
     remaining_budget_after: int
 
 
+class Origin(NamedTuple):
+    """The run that played a list."""
+
+    env: str
+    conditions: AllConditions
+    run: str = ""
+    """The coordinator's id, for the policies' random seeds."""
+    tier: Tier = "bwrap"
+    limits: ResourceLimits | None = None
+
+
 class Evaluations:
     def __init__(self, link: Link, tell: Tell, *, own: bool = False) -> None:
         """`own`: the command started this cluster. An environment that fails on its workers then raises
@@ -69,39 +81,35 @@ class Evaluations:
         self,
         cases: Cases,
         indexes: Sequence[int],
+        origin: Origin,
         *,
-        env: str,
-        conditions: AllConditions,
         actions: Sequence[bytes] = (),
         bundle: Bundle | None = None,
         record: Record = "actions",
-        run: str = "",
-        tier: Tier = "bwrap",
-        limits: ResourceLimits | None = None,
     ) -> AsyncIterator[tuple[int, EpisodeOutcome | None]]:
         """Plays some of a list's episodes again, by recorded `actions` (trajectories, one for each index) or
-        with the policy of `bundle`. Yields each index with its outcome as it arrives, then those without one.
-        `run`: the coordinator's id, for the policies' random seeds."""
+        with the policy of `bundle`. Yields each index with its outcome as it arrives, then those without
+        one."""
         for data in actions:
             await self.ask.upload(digest_of(data), data)
         if bundle is not None:
             await self.ask.upload(bundle.digest, bundle.packed)
-        how = conditions.conditions
+        how = origin.conditions.conditions
         if cases.submit_index == RANDOM:  # no policy could receive lists: recorded as arrays
             how = msgspec.structs.replace(how, observations="arrays")
         message = Evaluate(
             key=uuid.uuid4().hex,
-            env=env,
+            env=origin.env,
             bundle=None if bundle is None else bundle.digest,
             split=cases.split,
             cases=tuple(cases.env_instances[index] for index in indexes),
             record=record,
-            sandbox_tier=tier,
-            limits=limits or ResourceLimits(),
+            sandbox_tier=origin.tier,
+            limits=origin.limits or ResourceLimits(),
             replays=tuple(BlobRef(digest=digest_of(data), size=len(data)) for data in actions),
-            step_limit=conditions.step_limit,
+            step_limit=origin.conditions.step_limit,
             as_in=PlayedAs(
-                run=run,
+                run=origin.run,
                 submit_index=cases.submit_index,
                 env_instances=cases.env_instances,
                 indexes=tuple(indexes),

@@ -22,7 +22,7 @@ import msgspec
 
 from evopolicy_common.errors import DECODE_ERRORS, ProtocolError, raised_as
 from evopolicy_common.messages.bounds import Int, Many, Number, Word
-from evopolicy_common.messages.environment import Case
+from evopolicy_common.messages.environment import Case, Split
 from evopolicy_common.messages.operator import RunResult
 from evopolicy_common.messages.run_settings import RunSettings, Start
 
@@ -98,6 +98,9 @@ class Opening(msgspec.Struct, frozen=True, kw_only=True):
     """SHA-256 (hex) of the trials of candidates that chose a world's rules (STATE/worlds.jsonl); empty without any."""
     policy_seeds: Word
     """SHA-256 (hex) of the secret from which the policies' random seeds derive."""
+
+    def cases(self, split: Split) -> tuple[Case, ...]:
+        return {"train": self.train, "validation": self.validation, "heldout": self.heldout}[split]
 
 
 def document(content: EpochEntry | Opening | RunResult) -> bytes:

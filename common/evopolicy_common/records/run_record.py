@@ -133,12 +133,13 @@ class AgentResources(msgspec.Struct, frozen=True, kw_only=True):
         """Together with what earlier programs of the agent used, whose limits were the same."""
         if before is None:
             return self
-        added = ("cpu_s", "ended_for_memory", "refused_forks")
-        most = ("memory_peak_bytes", "disk_bytes")
         return msgspec.structs.replace(
             self,
-            **{name: round(getattr(before, name) + getattr(self, name), 3) for name in added},
-            **{name: max(getattr(before, name), getattr(self, name)) for name in most},
+            cpu_s=round(before.cpu_s + self.cpu_s, 3),
+            memory_peak_bytes=max(before.memory_peak_bytes, self.memory_peak_bytes),
+            disk_bytes=max(before.disk_bytes, self.disk_bytes),
+            ended_for_memory=before.ended_for_memory + self.ended_for_memory,
+            refused_forks=before.refused_forks + self.refused_forks,
         )
 
 

@@ -40,6 +40,12 @@ class TlsFiles(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     certificate: str
     private_key: str
 
+    def within(self, folder: Path) -> TlsFiles:
+        """The same files with paths from `folder`."""
+        names = (self.root_ca, self.certificate, self.private_key)
+        root_ca, certificate, private_key = (str(folder / name) for name in names)
+        return TlsFiles(root_ca=root_ca, certificate=certificate, private_key=private_key)
+
 
 class Credentials(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Everything one role needs to connect to a cluster and be admitted."""
@@ -90,10 +96,7 @@ def read_credentials(path: Path) -> Credentials:
         credentials = msgspec.json.decode(data, type=Credentials)
     if credentials.tls is None:
         return credentials
-    folder = Path(os.path.abspath(path.parent))
-    tls = TlsFiles(
-        **{name: str(folder / place) for name, place in msgspec.structs.asdict(credentials.tls).items()}
-    )
+    tls = credentials.tls.within(Path(os.path.abspath(path.parent)))
     for name in (tls.root_ca, tls.certificate):
         if not Path(name).is_file():
             raise ConfigError(f"{name}, which {path} names, is missing: copy the whole folder")

@@ -92,13 +92,12 @@ def router_config(
         if (machine.identity in admit if admit else machine.role != "router")
     )
     there = (installed_at or folder).absolute()
-    files = {"root_ca": "ca.pem", "certificate": "cert.pem", "private_key": "key.pem"}
     settings = transport.site_router_settings(
         cluster_of(root),
         tuple(listen or (f"tls/0.0.0.0:{PORT}",)),
         there / "passwords",
         [(machine.role, machine.identity) for machine in admitted],
-        TlsFiles(**{each: str(there / file) for each, file in files.items()}),
+        TlsFiles(root_ca="ca.pem", certificate="cert.pem", private_key="key.pem").within(there),
         upstream,
         certs.COORDINATOR,
         own.identity,

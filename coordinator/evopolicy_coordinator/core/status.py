@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable
-from typing import Any
 
 from evopolicy_common.messages.status import QueuedJobs, RunStatus, StatusReply, WorkerStatus
 from evopolicy_coordinator.core.agents import permits
@@ -36,14 +35,14 @@ def status(state: State, now: float, words: Words) -> StatusReply:
     # Computed once per profile and once per run: thousands of workers have few profiles, and hundreds of runs
     # share the groups.
     profiles = {worker.profile: None for worker in state.workers.values()}
-    shared = {profile: _shared(state, profile) for profile in profiles}
+    status_of = {profile: _workers(state, profile, now) for profile in profiles}
     groups: dict[str, list[JobGroup]] = {}
     waits: dict[JobGroup, Reason] = {}
     for group in state.groups.values():
         groups.setdefault(group.run, []).append(group)
         if (reason := waits_for(state, group)) is not None:
             waits[group] = reason
-    workers = tuple(_worker(state, worker, now, shared[worker.profile]) for worker in state.workers.values())
+    workers = tuple(status_of[worker.profile](worker) for worker in state.workers.values())
     runs = tuple(_run(state, run, groups.get(run.id, []), waits, words) for run in state.runs.values())
     return StatusReply(
         cluster="",
@@ -82,35 +81,38 @@ def _queue(state: State, waits: dict[JobGroup, Reason], words: Words) -> tuple[Q
     return tuple(queue)
 
 
-def _shared(state: State, profile: Profile) -> dict[str, Any]:
-    return {
-        "tiers": tuple(sorted(profile.key[1])),
-        "environments": tuple(sorted(profile.descriptions)),
-        "fingerprint": profile.fingerprint.class_name(cpu=state.settings.fingerprint_cpu),
-        "versions": {**profile.fingerprint.versions(), "cpu": profile.fingerprint.cpu},
-        "classes": profile.classes,
-        "refused": pins.refused_runs(state, profile),
-    }
+def _workers(state: State, profile: Profile, now: float) -> Callable[[Worker], WorkerStatus]:
+    """The status of each worker of a profile; what they share is computed once."""
+    tiers, environments = tuple(sorted(profile.key[1])), tuple(sorted(profile.descriptions))
+    fingerprint = profile.fingerprint.class_name(cpu=state.settings.fingerprint_cpu)
+    versions = {**profile.fingerprint.versions(), "cpu": profile.fingerprint.cpu}
+    refused = pins.refused_runs(state, profile)
 
+    def status_of(worker: Worker) -> WorkerStatus:
+        live = [lease for lease in worker.leases.values() if lease.live]
+        return WorkerStatus(
+            worker=worker.name,
+            host=worker.host,
+            slots=worker.slots,
+            state=worker.state,
+            tiers=tiers,
+            environments=environments,
+            fingerprint=fingerprint,
+            versions=versions,
+            held=len(live),
+            running=sum(lease.running for lease in live),
+            last_seen_s=max(0.0, now - worker.last_seen),
+            refused=refused,
+            boot_id=worker.kernel.boot_id,
+            hidden_bar=conflicts.conflict_of_worker(state, worker),
+            classes=profile.classes,
+            playing=dict(Counter(lease.job.group.run for lease in live if lease.running)),
+            installation=worker.installation,
+            missing_tiers=worker.missing_tiers,
+            failed_environments=worker.failed_environments,
+        )
 
-def _worker(state: State, worker: Worker, now: float, shared: dict[str, Any]) -> WorkerStatus:
-    live = [lease for lease in worker.leases.values() if lease.live]
-    return WorkerStatus(
-        worker=worker.name,
-        host=worker.host,
-        slots=worker.slots,
-        state=worker.state,
-        held=len(live),
-        running=sum(lease.running for lease in live),
-        last_seen_s=max(0.0, now - worker.last_seen),
-        boot_id=worker.kernel.boot_id,
-        hidden_bar=conflicts.conflict_of_worker(state, worker),
-        playing=dict(Counter(lease.job.group.run for lease in live if lease.running)),
-        installation=worker.installation,
-        missing_tiers=worker.missing_tiers,
-        failed_environments=worker.failed_environments,
-        **shared,
-    )
+    return status_of
 
 
 def _run(

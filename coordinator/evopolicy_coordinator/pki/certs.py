@@ -144,16 +144,16 @@ def _builder(
 
 
 def _key_usage(*, signs_certificates: bool) -> x509.KeyUsage:
-    others = dict.fromkeys(
-        ("content_commitment", "key_encipherment", "data_encipherment", "key_agreement"), False
-    )
     return x509.KeyUsage(
         digital_signature=not signs_certificates,
+        content_commitment=False,
+        key_encipherment=False,
+        data_encipherment=False,
+        key_agreement=False,
         key_cert_sign=signs_certificates,
         crl_sign=signs_certificates,
         encipher_only=False,
         decipher_only=False,
-        **others,
     )
 
 

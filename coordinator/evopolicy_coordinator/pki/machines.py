@@ -71,12 +71,9 @@ class Machines:
     @property
     def tls(self) -> TlsFiles | None:
         """The coordinator's own certificate; None before `certs init`."""
-        files = TlsFiles(
-            root_ca=str(self.folder / "ca.pem"),
-            certificate=str(self.folder / "coordinator.pem"),
-            private_key=str(self.folder / "coordinator-key.pem"),
-        )
-        return files if Path(files.private_key).exists() else None
+        key = "coordinator-key.pem"
+        files = TlsFiles(root_ca="ca.pem", certificate="coordinator.pem", private_key=key)
+        return files.within(self.folder) if (self.folder / key).exists() else None
 
     def all(self) -> tuple[Machine, ...]:
         """Every machine, including revoked ones, sorted by identity."""

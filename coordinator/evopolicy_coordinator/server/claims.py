@@ -62,9 +62,16 @@ class Claims:
             row = rows.get(key, _FREE)
             held = row.holder not in ("", message.holder) and self._until.get(key, 0.0) > now
             kept = row.holder == message.holder
-            known: dict[str, Any] = {"run": row.run, "kept": kept, "coordinator": self._process}
+            state = ClaimState(
+                granted=False,
+                holder=row.holder,
+                run=row.run,
+                kept=kept,
+                coordinator=self._process,
+                result=row.result,
+            )
             if row.result is not None or (held and message.result is None):
-                return ClaimState(granted=False, holder=row.holder, result=row.result, **known)
+                return state
             given_back = message.ttl_s <= 0.0 and message.result is None
             new = ClaimRow(
                 holder="" if given_back else message.holder,
@@ -77,12 +84,9 @@ class Claims:
                 await self._writer.call(lambda store: store.write_claim(*key, data))
                 rows[key] = new
             self._until[key] = now + message.ttl_s
-            return ClaimState(
-                granted=not given_back,
-                holder=new.holder,
-                previous="" if kept else row.holder,
-                result=message.result,
-                **known,
+            previous = "" if kept else row.holder
+            return msgspec.structs.replace(
+                state, granted=not given_back, holder=new.holder, previous=previous, result=message.result
             )
 
     async def _loaded(self, now: float) -> dict[tuple[str, str], ClaimRow]:

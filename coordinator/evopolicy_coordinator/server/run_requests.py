@@ -17,7 +17,6 @@ import hmac
 import secrets
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 from msgspec.structs import replace
 
@@ -62,6 +61,8 @@ from evopolicy_coordinator.server.request_checks import (
 )
 from evopolicy_coordinator.splits import EnvironmentSplits, SplitSource
 
+_Opens = operator.CreateRun | operator.Disclose | operator.Evaluate | operator.Rescore
+
 
 @contextlib.contextmanager
 def _wrong_settings_refused() -> Iterator[None]:
@@ -90,22 +91,23 @@ class RunRequests:
         self._source = source
 
     @_wrong_settings_refused()
-    def event(self, message: Any, request: int, stimulus_id: str) -> AnyEvent:
+    def event(self, message: _Opens, request: int, stimulus: str) -> AnyEvent:
         """Returns the event of a request that creates something."""
-        about = {"message": message, "request": request, "stimulus_id": stimulus_id}
         if isinstance(message, operator.Disclose):
-            return DisclosureRequested(**about, epochs=self._reader.epochs(message.runs))
+            epochs = self._reader.epochs(message.runs)
+            return DisclosureRequested(message=message, request=request, stimulus_id=stimulus, epochs=epochs)
         check_idempotency_key(message.key)
         if isinstance(message, operator.CreateRun):
             # A run of another coordinator is played again as any run, with this one's cases and a new secret.
             of = self._reader.replayed(message.settings.replay_of)
             row = self._run(message) if of is None else self._replay(message, of)
             require(message.run in ("", row.run), Refusal.UNKNOWN_RUN, f"unknown run {message.run[:64]!r}")
-            return RunRequested(**about, row=row)
+            return RunRequested(message=message, request=request, stimulus_id=stimulus, row=row)
         if isinstance(message, operator.Rescore):
-            of_run = self._reader.finished_with_result(message.run)
-            return EvaluationRequested(**about, row=self.rescore(message, *of_run))
-        return EvaluationRequested(**about, row=self._evaluation(message))
+            listed = self.rescore(message, *self._reader.finished_with_result(message.run))
+        else:
+            listed = self._evaluation(message)
+        return EvaluationRequested(message=message, request=request, stimulus_id=stimulus, row=listed)
 
     def _run(self, m: operator.CreateRun) -> RunRow:
         wanted = m.settings
@@ -138,10 +140,13 @@ class RunRequests:
                 largest = max(most, len(cases.validation), len(cases.heldout))
             check_job((*cases.train, *hidden), largest)
         secret = run_secret(self._reader.state, m.key)
+        run, capability, salt = self._own(m.key, cases.epoch)
         return RunRow(
-            **self._own(m.key, cases.epoch),
+            run=run,
             key=m.key,
+            capability=capability,
             secret=secret,
+            salt=salt,
             policy_seeds=hashlib.sha256(secret).hexdigest(),
             settings=wanted,
             budget=budget,
@@ -170,22 +175,21 @@ class RunRequests:
             )
         wanted, known = m.settings, of.settings
         if wanted.start is not None and known.start is not None:
-            own = {name: getattr(known.start, name) for name in ("parent_scored", "line")}
-            wanted = replace(wanted, start=replace(wanted.start, **own))
+            start = replace(wanted.start, parent_scored=known.start.parent_scored, line=known.start.line)
+            wanted = replace(wanted, start=start)
         same = replace(known, replay_of=of.run, notes=wanted.notes)
         names = [each for each in wanted.__struct_fields__ if getattr(wanted, each) != getattr(same, each)]
         if names:
             raise ConfigError(f"a replay of run {of.run} has other settings than the run: {', '.join(names)}")
-        return replace(of, key=m.key, settings=wanted, **self._own(m.key, of.epoch))
+        run, capability, salt = self._own(m.key, of.epoch)
+        return replace(of, run=run, key=m.key, capability=capability, salt=salt, settings=wanted)
 
-    def _own(self, key: str, epoch: str) -> dict[str, Any]:
-        """The name and the secrets that every run has of its own, a replay too. With other cases it is another run."""
+    def _own(self, key: str, epoch: str) -> tuple[str, str, bytes]:
+        """Name, token and salt: every run has its own, a replay too. With other cases it is another run."""
         state = self._reader.state
-        return {
-            "run": f"r-{of_run(state, f'name|{epoch}', key)[:8].hex()}",
-            "capability": base64.urlsafe_b64encode(of_run(state, "capability", key)).decode().rstrip("="),
-            "salt": of_run(state, "salt", key)[:SALT_BYTES],
-        }
+        capability = base64.urlsafe_b64encode(of_run(state, "capability", key)).decode().rstrip("=")
+        run = f"r-{of_run(state, f'name|{epoch}', key)[:8].hex()}"
+        return run, capability, of_run(state, "salt", key)[:SALT_BYTES]
 
     def _evaluation(self, m: operator.Evaluate) -> EvaluationRow:
         # The finished run whose episodes are replayed supplies the policy seeds, and the cases if they came from
@@ -194,7 +198,7 @@ class RunRequests:
         check_bundle(self._blobs, m.bundle)
         check_limits(m.limits)
         run = of if _has_derived_cases(of) else None
-        cases = getattr(self._splits(m.env, None, None) if run is None else run, m.split)
+        cases = (run or self._splits(m.env, None, None)).cases(m.split)
         ids = tuple(range(len(cases))) if m.cases is None else m.cases
         if len(ids) > MAX_EPISODES_PER_SUBMIT:
             raise ConfigError(f"{len(ids):,} cases; {MAX_EPISODES_PER_SUBMIT:,} is the maximum at once")

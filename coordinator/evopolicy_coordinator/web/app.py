@@ -174,8 +174,10 @@ class Site:
         """A page whose parts are kept up to date; status 304 for a browser that has it."""
         words = _words(request)
         view = await asyncio.to_thread(self.view_of(name, words))
-        shown: dict[str, Any] = {"view": view, "live": " ".join(view.elements()), "words": words}
-        answer = self._page(request, template, here=name, title=title, **shown, **more)
+        live = " ".join(view.elements())
+        answer = self._page(
+            request, template, here=name, title=title, view=view, live=live, words=words, **more
+        )
         etag = f'"{hashlib.sha256(answer.body).hexdigest()}"'
         if request.headers.get("if-none-match") == etag:
             return Response(status_code=304, headers={"etag": etag})
@@ -373,11 +375,13 @@ def listen(host: str, port: int) -> socket.socket:
         raise ConfigError(text) from error
 
 
-async def serve(site: Site, sock: socket.socket, ready: Callable[[], None], **tls: Path | None) -> None:
-    """Serves until the task is cancelled. `tls`: as for `serving`."""
+async def serve(
+    site: Site, sock: socket.socket, ready: Callable[[], None], *, certificate: Path | None = None
+) -> None:
+    """Serves until the task is cancelled. `certificate`: as for `serving`."""
     # A connection that never ends its TLS handshake holds a descriptor for a minute.
     _, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
-    async with site.running(), serving(site.app(), sock, **tls) as task:
+    async with site.running(), serving(site.app(), sock, certificate=certificate) as task:
         ready()
         await asyncio.shield(task)

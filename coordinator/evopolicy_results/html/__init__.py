@@ -3,10 +3,10 @@ there."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Sequence
 from functools import cache
 from importlib.resources import files
-from typing import Any
+from typing import Any, NamedTuple
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
@@ -22,9 +22,11 @@ def visible(value: object) -> object:
     return harmless(value) if type(value) is str else value
 
 
-def notice(title: str, lines: Iterable[str] = ()) -> dict[str, Any]:
+class Notice(NamedTuple):
     """A note above a page's content."""
-    return {"title": title, "lines": list(lines)}
+
+    title: str
+    lines: Sequence[str] = ()
 
 
 def section(ident: str, nav: str, *, title: str = "", ask: str = "", **parts: Any) -> dict[str, Any]:

@@ -14,7 +14,7 @@ from evopolicy_common.records.words import in_words
 from evopolicy_common.terminal import number
 from evopolicy_results.behaviour.trace import Trace, diff, sources
 from evopolicy_results.figures.plot import Plot
-from evopolicy_results.html import notice, page, section, visible
+from evopolicy_results.html import Notice, page, section, visible
 from evopolicy_results.html.run_page import run_view
 from evopolicy_results.reading.environments import grouped, title_of
 from evopolicy_results.reading.records import Run
@@ -104,7 +104,7 @@ def index_page(
         lead=answers.scope,
         facts=[],
         looks=looks,
-        notices=[notice(study.post_hoc)] if study.post_hoc else [],
+        notices=[Notice(study.post_hoc)] if study.post_hoc else [],
         answers=answers,
         overview=by_name.get("overview"),
         sections=[

@@ -13,7 +13,7 @@ from evopolicy_results.behaviour.trace import Trace
 from evopolicy_results.figures.line_chart import Line, chart
 from evopolicy_results.figures.plot import inline_svg
 from evopolicy_results.figures.timelines import Row, timeline_svg
-from evopolicy_results.html import View, part
+from evopolicy_results.html import Notice, View, part
 from evopolicy_results.reading.agent_log import Evidence
 from evopolicy_results.reading.environments import title_of
 from evopolicy_results.reading.records import Submit
@@ -57,7 +57,7 @@ def run_view(
     env: str,
     look: Look | None,
     facts: Iterable[tuple[str, object]],
-    notices: Sequence[Mapping[str, object]] = (),
+    notices: Sequence[Notice] = (),
     budget: int = 0,
     reference: tuple[str, float] | None = None,
     is_finished: bool = True,

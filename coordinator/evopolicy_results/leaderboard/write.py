@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 
 import msgspec
 
-from evopolicy_results.html import notice, page, section
+from evopolicy_results.html import Notice, page, section
 from evopolicy_results.html.pages import table_view
 from evopolicy_results.leaderboard.bundles import Board, LabBundle, boards
 from evopolicy_results.publish.findings import KINDS
@@ -276,7 +276,7 @@ def _checking(bundles: Sequence[LabBundle]) -> dict[str, Any]:
     return section("check", "Check it yourself", texts=texts, code="\n".join(lines))
 
 
-def _notices(bundles: Sequence[LabBundle]) -> list[dict[str, Any]]:
+def _notices(bundles: Sequence[LabBundle]) -> list[Notice]:
     shown = [bundle for bundle in bundles if not bundle.refused]
     unknown = [bundle.file for bundle in shown if bundle.checked.state_of("identity") != "ok"]
     not_replayed = [bundle.file for bundle in shown if bundle.checked.state_of("replay") != "ok"]
@@ -298,7 +298,7 @@ def _notices(bundles: Sequence[LabBundle]) -> list[dict[str, Any]]:
             [each[:200] for each in processors] if len(processors) > 1 else [],
         ),
     )
-    return [notice(title, lines) for title, lines in notices if lines]
+    return [Notice(title, lines) for title, lines in notices if lines]
 
 
 def _table(

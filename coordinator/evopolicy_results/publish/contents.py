@@ -198,7 +198,12 @@ def listing(entries: Iterable[journal.EpochEntry], published: Iterable[str]) -> 
         state = "replayed" if each.replay_of else status.get(each.run, "not finished")
         later = each.run if each.replay_of else last[place(each)]
         return Listed(
-            **{name: getattr(each, name) for name in ("run", "entry", "env", "exp_id", "repeat", "attempt")},
+            run=each.run,
+            entry=each.entry,
+            env=each.env,
+            exp_id=each.exp_id,
+            repeat=each.repeat,
+            attempt=each.attempt,
             state="published" if each.run in chosen else state,
             replaced_by="" if later == each.run else later,
         )

@@ -9,7 +9,7 @@ from typing import Any, Literal, NamedTuple, Protocol, TypeVar
 import msgspec
 
 from evopolicy_common.errors import DECODE_ERRORS, BundleError, ProtocolError, raised_as
-from evopolicy_common.messages.environment import Split
+from evopolicy_common.messages.environment import Case, Split
 from evopolicy_common.messages.operator import RunResult
 from evopolicy_common.records import journal
 from evopolicy_common.records.journal import Opening
@@ -83,9 +83,8 @@ class PublishedRun(msgspec.Struct, frozen=True, kw_only=True):
     result_bytes: bytes
     as_written: dict[str, Any]
 
-    def cases(self, split: Split) -> tuple[Any, ...]:
-        cases: tuple[Any, ...] = getattr(self.opening, split)
-        return cases
+    def cases(self, split: Split) -> tuple[Case, ...]:
+        return self.opening.cases(split)
 
     def recordings(self, files: Files, group: str) -> list[bytes | None]:
         """The packed recordings of a group's episodes, by its name; empty without any. ProtocolError for damaged

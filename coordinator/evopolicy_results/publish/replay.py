@@ -25,7 +25,7 @@ from evopolicy_common.records.episodes import compare
 from evopolicy_common.records.episodes.trajectory import Trajectory
 from evopolicy_common.records.splits import FILE_STEMS, SPLITS, SplitFile, cases_hash
 from evopolicy_common.wire import credentials, transport
-from evopolicy_results.evaluations import Cases, Evaluations, sample, unlike
+from evopolicy_results.evaluations import Cases, Evaluations, Origin, sample, unlike
 from evopolicy_results.publish.contents import Group
 from evopolicy_results.publish.findings import Checked, Files, PublishedRun, State
 from evopolicy_results.publish.run_rules import recording_of
@@ -140,7 +140,7 @@ async def _replayed(
         return
     actions = [compare.action_log(recording_of(data).actions) for data in recorded.values()]
     async for index, outcome in evaluations.replayed(
-        part.cases, list(recorded), env=settings.env, conditions=settings, actions=actions
+        part.cases, list(recorded), Origin(settings.env, settings), actions=actions
     ):
         place, told = f"{group.name}, episode {index}", group.episodes[index].episode_return
         if outcome is None or outcome.trajectory is None:

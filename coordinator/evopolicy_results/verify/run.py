@@ -29,7 +29,7 @@ from evopolicy_common.records.policies.checkpoints import bundle_of
 from evopolicy_common.records.rescores import FOLDER, rescore_names
 from evopolicy_common.records.splits import SPLITS
 from evopolicy_common.wire.operator_client import TIMEOUT_S
-from evopolicy_results.evaluations import Evaluations, unlike
+from evopolicy_results.evaluations import Evaluations, Origin, unlike
 from evopolicy_results.reading.comparability import comparable
 from evopolicy_results.verify import numbers
 from evopolicy_results.verify.source import EpisodeList, RunUnderTest
@@ -87,14 +87,8 @@ class Verifier:
     def __init__(self, evaluations: Evaluations, run: RunUnderTest) -> None:
         self._evaluations = evaluations
         self._run = run
-        dimensions = run.record.experiment_dimensions
-        self._conditions: dict[str, Any] = {
-            "env": run.record.env,
-            "conditions": dimensions,
-            "run": run.record.run,
-            "tier": run.record.sandbox_tier,
-            "limits": dimensions.limits,
-        }
+        record, dimensions = run.record, run.record.experiment_dimensions
+        self._origin = Origin(record.env, dimensions, record.run, record.sandbox_tier, dimensions.limits)
         self._knows_run = False
         self._recorded: dict[int, _Recording] = {}
         """Of the list that was replayed last, by index."""
@@ -159,9 +153,9 @@ class Verifier:
         async for index, outcome in self._evaluations.replayed(
             played,
             list(recorded),
+            self._origin,
             actions=[recording.actions for recording in recorded.values()],
             record="full" if played.split == "train" else "actions",
-            **self._conditions,
         ):
             if outcome is None:
                 self.report.differs(played.name(index), "could not be played again")
@@ -196,7 +190,7 @@ class Verifier:
         if bundle.digest != played.submit.bundle:
             return  # a difference that the check of numbers has reported
         async for index, outcome in self._evaluations.replayed(
-            played, indexes, bundle=bundle, record="full", **self._conditions
+            played, indexes, self._origin, bundle=bundle, record="full"
         ):
             if outcome is None or (recording := self._recorded.get(index)) is None:
                 continue

@@ -14,6 +14,7 @@ from msgspec.structs import replace
 from evopolicy_common.messages import gateway, operator
 from evopolicy_common.messages.gateway import CANCELLED
 from evopolicy_common.messages.status import RetriedJobs
+from evopolicy_common.records.splits import SPLITS
 from evopolicy_coordinator.core.agents import requests
 from evopolicy_coordinator.core.contract import events
 from evopolicy_coordinator.core.contract.reasons import NotDoneError, Reason
@@ -86,8 +87,8 @@ def _check(row: RunRow) -> None:
         raise NotDoneError("submit_bounds", least=least, most=most)
     if least > row.budget:
         raise NotDoneError("minimum_over_budget", least=least, budget=row.budget)
-    for split in ("train", "validation", "heldout"):
-        if not getattr(row, split):
+    for split in SPLITS:
+        if not row.cases(split):
             raise NotDoneError("no_cases", split=split)
 
 

@@ -5,11 +5,11 @@ Rule that this module owns: a group follows from stored rows alone, so it is the
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Literal
 
-from evopolicy_common.messages.environment import Case
-from evopolicy_common.messages.episode import RANDOM
-from evopolicy_common.messages.gateway import Conditions
+from evopolicy_common.messages.environment import Case, PolicyScope
+from evopolicy_common.messages.episode import RANDOM, BlobRef, Record
+from evopolicy_common.messages.gateway import Conditions, VideoOption
 from evopolicy_common.messages.operator import PlayedAs
 from evopolicy_coordinator.core.contract.records import (
     EvaluationRow,
@@ -47,6 +47,7 @@ def train(run: Run, row: SubmitRow, step: Step) -> JobGroup:
         stimulus_id=row.stimulus_id,
         created_at=row.accepted_at,
         env_meta=env_meta(run, row),
+        secret=run.row.secret,
         bundle=row.bundle,
         case_ids=row.env_instances,
         occurrences=occurrences(row.env_instances),
@@ -58,7 +59,7 @@ def train(run: Run, row: SubmitRow, step: Step) -> JobGroup:
 
 def hidden(split: Literal["validation", "heldout"], run: Run, row: SubmitRow, step: Step) -> JobGroup:
     """A checkpoint on all cases of a hidden split."""
-    settings, cases = run.row.settings, getattr(run.row, split)
+    settings, cases = run.row.settings, run.row.cases(split)
     pool = settings.hidden_evaluation == "pool"
     return _group(
         split,
@@ -70,6 +71,7 @@ def hidden(split: Literal["validation", "heldout"], run: Run, row: SubmitRow, st
         priority=HIDDEN,
         stimulus_id=row.stimulus_id,
         env_meta=env_meta(run, row) | ({"remaining_budget_after": 0} if pool else {}),
+        secret=run.row.secret,
         bundle=row.bundle,
         modulo=len(cases) if pool else len(row.env_instances),
         scope=settings.policy_scope,
@@ -140,29 +142,48 @@ def _group(
     priority: int,
     stimulus_id: str,
     created_at: float | None = None,
-    **differing: object,
+    secret: bytes | None,
+    env_meta: dict[str, object],
+    split: str = "",
+    bundle: str | None = None,
+    case_ids: tuple[int, ...] = (),
+    occurrences: tuple[int, ...] = (),
+    modulo: int = 0,
+    scope: PolicyScope = "episode",
+    record: Record = "actions",
+    video: VideoOption = "off",
+    replays: tuple[BlobRef, ...] = (),
+    indexes: tuple[int, ...] = (),
 ) -> JobGroup:
-    """A group without jobs yet. `differing`: the fields of its template that are not the usual ones."""
-    n = len(cases)
-    usual: dict[str, Any] = {
-        "bundle": None,
-        "case_ids": tuple(range(n)),
-        "occurrences": (0,) * n,
-        "secret": owner.row.secret,
-        "split": kind,
-        "modulo": n,
-        "scope": "episode",
-        "record": "actions",
-        "video": "off",
-    }
-    fields = usual | _conditions(owner) | differing
+    """A group without jobs yet. Left out: its kind is the split, its cases are in order, each of them once."""
+    row, n = owner.row, len(cases)
+    how: Conditions
+    if isinstance(row, RunRow):
+        how, tier, limits = row.settings, row.settings.sandbox_tier, row.settings.limits
+    else:
+        how, tier, limits = _place(row).conditions, row.tier, row.limits
     template = Template(
         env=owner.flow.env,
+        bundle=bundle,
         cases=cases,
+        case_ids=case_ids or tuple(range(n)),
+        occurrences=occurrences or (0,) * n,
+        secret=secret,
+        split=split or kind,
         submit_index=submit_index,
-        per_job=fields["modulo"] if fields["scope"] == "submit" else 1,
-        max_steps=owner.row.max_steps,
-        **fields,
+        modulo=modulo or n,
+        scope=scope,
+        env_meta=env_meta,
+        observations=how.observations,
+        record=record,
+        video=video,
+        tier=tier,
+        limits=limits,
+        max_steps=row.max_steps,
+        failed_episodes=how.failed_episodes,
+        published=how.profile != "own",
+        replays=replays,
+        indexes=indexes,
     )
     return JobGroup(
         id=id,
@@ -175,18 +196,6 @@ def _group(
         priority=priority,
         created_at=step.now if created_at is None else created_at,
     )
-
-
-def _conditions(owner: Run | Evaluation) -> dict[str, Any]:
-    """How all episodes of a run or an evaluation are played."""
-    row = owner.row
-    how: Conditions
-    if isinstance(row, RunRow):
-        how, tier, limits = row.settings, row.settings.sandbox_tier, row.settings.limits
-    else:
-        how, tier, limits = _place(row).conditions, row.tier, row.limits
-    shared = {"observations": how.observations, "failed_episodes": how.failed_episodes}
-    return {**shared, "published": how.profile != "own", "tier": tier, "limits": limits}
 
 
 def env_meta(run: Run, row: SubmitRow) -> dict[str, object]:

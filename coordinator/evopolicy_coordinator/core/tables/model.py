@@ -11,7 +11,7 @@ from collections import deque
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Any, Literal, NamedTuple, TypeVar, get_args
+from typing import Literal, NamedTuple, TypeVar, get_args
 
 from evopolicy_common.messages.environment import (
     Case,
@@ -91,7 +91,7 @@ HIDDEN_FIRST = ((HIDDEN,), (TRAIN,), (REFERENCE,))
 """The same on a kernel that is reserved for hidden jobs (`agents.precedence`)."""
 
 
-def by_priority(make: Callable[[], Any]) -> list[Any]:
+def by_priority(make: Callable[[], T]) -> list[T]:
     return [make() for _ in range(N_PRIORITIES)]
 
 
@@ -131,10 +131,8 @@ class Template:
     submit_index: int
     modulo: int
     """`episode_index` is the index modulo this."""
-    per_job: int
-    """Episodes in a job: 1, or with policy scope `submit` the number of episodes that share one Policy."""
     scope: PolicyScope
-    env_meta: dict[str, Any]
+    env_meta: dict[str, object]
     observations: ObservationForm
     record: Record
     video: VideoOption
@@ -148,6 +146,11 @@ class Template:
     """Recorded actions for each index, in place of a policy; empty for none."""
     indexes: tuple[int, ...] = ()
     """For each index, the index in the list that the case was taken from; empty where they are equal."""
+
+    @property
+    def per_job(self) -> int:
+        """Episodes in a job: 1, or with policy scope `submit` the number of episodes that share one Policy."""
+        return self.modulo if self.scope == "submit" else 1
 
 
 @dataclass(slots=True, eq=False)

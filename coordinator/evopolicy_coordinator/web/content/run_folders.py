@@ -14,9 +14,10 @@ import time
 from collections.abc import Iterable, Mapping, Sequence
 from datetime import datetime
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import msgspec
+from msgspec.structs import replace
 
 from evopolicy_common.errors import DECODE_ERRORS, ProtocolError
 from evopolicy_common.messages.operator import CreateRun
@@ -36,7 +37,6 @@ T = TypeVar("T")
 
 _MAX_SUMMARY_BYTES = 8 << 20
 _TOKENS = ("input_noncached", "cache_read", "cache_creation", "output")
-_FROM_SETTINGS = ("entry", "env", "exp_id", "repeat", "budget", "hidden_cases", "start", "replay_of")
 
 
 class RunFacts(msgspec.Struct, frozen=True, kw_only=True):
@@ -203,8 +203,8 @@ class Reader:
         stamp = (info.st_mtime_ns, info.st_size)
         known = self._records.get(folder)
         if known is None or known[0] != stamp:
-            known = self._records[folder] = stamp, msgspec.structs.replace(_finished(folder), stamp=stamp)
-        return known[1] if entry is None else msgspec.structs.replace(known[1], repeat=entry.repeat)
+            known = self._records[folder] = stamp, replace(_finished(folder), stamp=stamp)
+        return known[1] if entry is None else replace(known[1], repeat=entry.repeat)
 
     def submits(self, folder: Path) -> list[Submit]:
         """The submits of a run, in order; each summary is read once."""
@@ -235,24 +235,25 @@ class Reader:
         run = "" if intended is None else intended.run
         status, submits = by_run.get(run), self.submits(folder)
         alive = _agent_alive(folder) if status is None else _may_be_alive(status)
-        facts: dict[str, Any] = {**_placed(folder), "run": run, "agent_alive": alive, "budget": None}
-        facts["state"] = "open" if alive else "interrupted"
+        facts = replace(_placed(folder, "open" if alive else "interrupted"), run=run, agent_alive=alive)
         if entry is not None:
-            facts |= _of_entry(entry)
+            facts = _with_entry(facts, entry)
             if entry.state != "pending":
-                facts["state"] = "open" if entry.state == "running" else entry.state
+                facts = replace(facts, state="open" if entry.state == "running" else entry.state)
         if intended is not None:
-            facts |= {name: getattr(intended.settings, name) for name in _FROM_SETTINGS}
+            given = intended.settings
+            facts = replace(facts, entry=given.entry, env=given.env, exp_id=given.exp_id, repeat=given.repeat)
+            facts = replace(facts, budget=given.budget, hidden_cases=given.hidden_cases)
+            facts = replace(facts, start=given.start, replay_of=given.replay_of)
         if submits:
             used, last = submits[-1].consumed, submits[-1].summary
-            facts |= {"used": used, "n_submits": len(submits), "best": _best(submits)}
-            facts["budget"] = facts["budget"] or (last and used + last.remaining_budget)
+            budget = facts.budget or (last and used + last.remaining_budget)
+            facts = replace(facts, budget=budget, used=used, n_submits=len(submits), best=_best(submits))
         if status is not None:
-            told = _of_status(status)
-            facts |= {name: told[name] for name in ("state", "budget", "waits_for", "running", "queued")}
+            facts = _with_status(facts, status)
         with contextlib.suppress(OSError):
-            facts["started_at"] = (folder / open_run.INTENDED).stat().st_mtime
-        return RunFacts(**facts)
+            facts = replace(facts, started_at=(folder / open_run.INTENDED).stat().st_mtime)
+        return facts
 
     def _forget(self, runs: Iterable[RunFacts]) -> None:
         kept = {run.path for run in runs}
@@ -265,11 +266,11 @@ def _best(submits: Iterable[Submit]) -> float | None:
     return max((one.mean_return for one in submits if one.mean_return is not None), default=None)
 
 
-def _placed(folder: Path) -> dict[str, Any]:
+def _placed(folder: Path, state: str) -> RunFacts:
     """The facts that follow from the path of a run's folder."""
     entry, env, exp_id = folder.parts[-3:]
-    env = env.replace("_", "/", 1)
-    return {"key": key_of(str(folder)), "path": folder, "entry": entry, "env": env, "exp_id": exp_id}
+    env, key = env.replace("_", "/", 1), key_of(str(folder))
+    return RunFacts(key=key, path=folder, entry=entry, env=env, exp_id=exp_id, state=state)
 
 
 def _finished(folder: Path) -> RunFacts:
@@ -277,7 +278,7 @@ def _finished(folder: Path) -> RunFacts:
     try:
         record = read_record(folder)
     except (OSError, ProtocolError) as error:
-        return RunFacts(**_placed(folder), state="unreadable", error=str(error), finished=True)
+        return replace(_placed(folder, "unreadable"), error=str(error), finished=True)
     learn_names([record])
     outcome, dimensions, tokens = record.outcome, record.experiment_dimensions, record.agent.tokens
     retries = outcome.auxiliary.get("infrastructure_retries")
@@ -313,49 +314,43 @@ def _finished(folder: Path) -> RunFacts:
 
 def _elsewhere(key: str, entry: SweepRun | None, status: RunStatus | None) -> RunFacts:
     """A run without a folder here: it has not started, or another host plays it."""
-    facts: dict[str, Any] = {"key": key_of(key), "path": None}
+    facts = RunFacts(key=key_of(key), path=None, entry="", env="", state="")
     if entry is not None:
-        names = ("run", "state", "n_submits", "wall_s", "score", "random")
-        facts |= {**_of_entry(entry), **{name: getattr(entry, name) for name in names}}
-        facts |= {"exp_id": entry.name, "used": entry.budget_used}
-        facts["finished"] = entry.state not in ("pending", "running")
+        finished = entry.state not in ("pending", "running")
+        facts = replace(_with_entry(facts, entry), run=entry.run, exp_id=entry.name, wall_s=entry.wall_s)
+        facts = replace(facts, state=entry.state, finished=finished, score=entry.score, random=entry.random)
+        facts = replace(facts, n_submits=entry.n_submits, used=entry.budget_used)
     elif status is not None:
-        facts |= {name: getattr(status, name) for name in ("entry", "env", "repeat")}
-        facts["exp_id"] = status.exp_id or status.run
+        name = status.exp_id or status.run
+        facts = replace(facts, entry=status.entry, env=status.env, exp_id=name, repeat=status.repeat)
     if status is not None:
-        facts |= {**_of_status(status), "host": facts.get("host") or status.agent_host}
-    return RunFacts(**facts)
+        used, since = status.budget - status.remaining_budget, status.created_at or None
+        facts = replace(_with_status(facts, status), run=status.run, host=facts.host or status.agent_host)
+        facts = replace(facts, used=used, n_submits=status.n_submits, best=status.best_mean, started_at=since)
+    return facts
 
 
-def _of_entry(entry: SweepRun) -> dict[str, Any]:
-    """The facts that a sweep's index has of every run of it."""
+def _with_entry(facts: RunFacts, entry: SweepRun) -> RunFacts:
+    """With the facts that a sweep's index has of every run of it."""
     tokens = [each for each in (entry.tokens, entry.earlier) if each]
-    return {
-        "entry": entry.agent,
-        "env": entry.env,
-        "repeat": entry.repeat,
-        "attempt": entry.attempt,
-        "tokens": sum(int(each.get(name) or 0) for each in tokens for name in _TOKENS),
-        "cost": sum((float(each.get("cost") or 0.0) for each in tokens), 0.0),
-        "error": entry.error or "",
-        "host": entry.host,
-    }
+    return replace(
+        facts,
+        entry=entry.agent,
+        env=entry.env,
+        repeat=entry.repeat,
+        attempt=entry.attempt,
+        tokens=sum(int(each.get(name) or 0) for each in tokens for name in _TOKENS),
+        cost=sum((float(each.get("cost") or 0.0) for each in tokens), 0.0),
+        error=entry.error or "",
+        host=entry.host,
+    )
 
 
-def _of_status(status: RunStatus) -> dict[str, Any]:
-    """The facts of an unfinished run that the cluster has."""
-    return {
-        "run": status.run,
-        "state": status.phase,
-        "budget": status.budget,
-        "used": status.budget - status.remaining_budget,
-        "n_submits": status.n_submits,
-        "best": status.best_mean,
-        "waits_for": status.waits_for,
-        "running": status.running,
-        "queued": status.queued,
-        "started_at": status.created_at or None,
-    }
+def _with_status(facts: RunFacts, status: RunStatus) -> RunFacts:
+    """With the facts that only the cluster has of an unfinished run."""
+    waits_for, running, queued = status.waits_for, status.running, status.queued
+    facts = replace(facts, state=status.phase, budget=status.budget)
+    return replace(facts, waits_for=waits_for, running=running, queued=queued)
 
 
 def _may_be_alive(status: RunStatus) -> bool:

@@ -15,7 +15,7 @@ from evopolicy_coordinator.web.content.cluster import Cluster
 from evopolicy_coordinator.web.content.remarks import remarks, served_by
 from evopolicy_coordinator.web.content.rendering import PAGE_ROWS, Words, ident, paged, part
 from evopolicy_coordinator.web.content.run_folders import RunFacts, Runs
-from evopolicy_results.html import View, notice
+from evopolicy_results.html import Notice, View
 from evopolicy_results.reading.environments import title_of
 
 _NOTICE_LINES = 5
@@ -74,16 +74,16 @@ def _cluster_facts(status: StatusReply) -> list[tuple[str, str]]:
     ]
 
 
-def _cluster_notices(cluster: Cluster, status: StatusReply) -> list[dict[str, Any]]:
+def _cluster_notices(cluster: Cluster, status: StatusReply) -> list[Notice]:
     silent = "The coordinator does not answer" + (
         "; this is the last that is known." if cluster.status else "."
     )
     why = cluster.trouble or ("" if cluster.status else "It has not answered yet.")
-    notices: list[dict[str, Any]] = []
+    notices: list[Notice] = []
     for title, lines in {silent: [why], **remarks(status)}.items():
         if texts := [line for line in lines if line]:
             more = [f"… and {len(texts) - _NOTICE_LINES} more"] if len(texts) > _NOTICE_LINES else []
-            notices.append(notice(title, texts[:_NOTICE_LINES] + more))
+            notices.append(Notice(title, texts[:_NOTICE_LINES] + more))
     return notices
 
 

@@ -22,7 +22,7 @@ from evopolicy_coordinator.web.content.run_detail import IMAGES, MAX_WORDS, Code
 from evopolicy_coordinator.web.content.run_folders import Reader, RunFacts, Runs
 from evopolicy_results.behaviour.trace import Trace, diff, trace
 from evopolicy_results.figures.line_chart import chart
-from evopolicy_results.html import View, notice
+from evopolicy_results.html import Notice, View
 from evopolicy_results.html.run_page import run_view
 from evopolicy_results.reading.reader import read_run
 from evopolicy_results.reading.records import Submit
@@ -120,17 +120,17 @@ def _run_facts(run: RunFacts, may_show: bool) -> list[tuple[str, str]]:
     return [(name, str(value)) for name, value in facts.items() if value]
 
 
-def _one_run_notices(run: RunFacts, may_show: bool) -> list[dict[str, Any]]:
-    notices: list[dict[str, Any]] = []
+def _one_run_notices(run: RunFacts, may_show: bool) -> list[Notice]:
+    notices: list[Notice] = []
     if run.waits_for:
-        notices.append(notice(f"It waits for {run.waits_for}."))
+        notices.append(Notice(f"It waits for {run.waits_for}."))
     if run.error:
-        notices.append(notice("Why it ended so", [run.error]))
+        notices.append(Notice("Why it ended so", [run.error]))
     if run.finished and not may_show and run.state == "completed":
-        notices.append(notice("Its hidden scores are shown once no agent of a related run is alive."))
+        notices.append(Notice("Its hidden scores are shown once no agent of a related run is alive."))
     if run.path is None:
         where = f" on {run.host}" if run.host else ""
-        notices.append(notice(f"Its folder is not on this host{where}: only the cluster's data are shown."))
+        notices.append(Notice(f"Its folder is not on this host{where}: only the cluster's data are shown."))
     return notices
 
 

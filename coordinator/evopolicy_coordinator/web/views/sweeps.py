@@ -13,7 +13,7 @@ from evopolicy_common.terminal import counted, duration, number, short
 from evopolicy_coordinator.web.content.cluster import Cluster
 from evopolicy_coordinator.web.content.rendering import STATES, Words, ident, paged, part, state_words
 from evopolicy_coordinator.web.content.run_folders import RunFacts, Runs, Sweep
-from evopolicy_results.html import View, notice
+from evopolicy_results.html import Notice, View
 from evopolicy_results.reading.environments import title_of
 from evopolicy_results.studies.palette import Look, looks
 
@@ -30,8 +30,8 @@ def sweeps_view(runs: Runs, cluster: Cluster | None, words: Words, roots: Sequen
     cells = MAX_CELLS
     for sweep in runs.sweeps:
         name = ident("sweep", str(sweep.root))
-        matrix, cells = _matrix(sweep, runs, agents, cells)
-        view.row("matrices", name, part("matrix", ident=name, **matrix))
+        matrix, cells = _matrix(name, sweep, runs, agents, cells)
+        view.row("matrices", name, matrix)
     shown, pages = paged(sorted(every, key=_order), words, _row_texts)
     view.parts |= {
         "facts": part("facts", facts=_sweep_facts(every)),
@@ -41,9 +41,10 @@ def sweeps_view(runs: Runs, cluster: Cluster | None, words: Words, roots: Sequen
     for run in shown:
         may_show = runs.may_show(run)
         score, random = (run.score, run.random) if may_show else (None, None)
-        about = {"run": run, "look": agents[run.entry], "score": score, "random": random}
         hidden, name = run.finished and not may_show and run.state == "completed", ident("row", run.key)
-        view.row("run-rows", name, part("run_row", ident=name, hidden=hidden, **about))
+        look = agents[run.entry]
+        row = part("run_row", ident=name, run=run, look=look, score=score, random=random, hidden=hidden)
+        view.row("run-rows", name, row)
     return view
 
 
@@ -83,34 +84,34 @@ def _sweep_facts(every: Sequence[RunFacts]) -> list[tuple[str, str]]:
 
 def _run_notices(
     runs: Runs, every: Sequence[RunFacts], cluster: Cluster | None, roots: Sequence[Path]
-) -> list[dict[str, Any]]:
-    notices: list[dict[str, Any]] = []
+) -> list[Notice]:
+    notices: list[Notice] = []
     if cluster is not None and cluster.trouble:
         title = "The coordinator does not answer; this is the last that is known."
-        notices.append(notice(title, [cluster.trouble]))
+        notices.append(Notice(title, [cluster.trouble]))
     if runs.shut is None and any(run.finished for run in every):
         title = "Hidden scores are not shown: without the coordinator nobody knows which agents are alive."
-        notices.append(notice(title))
+        notices.append(Notice(title))
     elif hidden := sum(run.finished and run.state == "completed" and not runs.may_show(run) for run in every):
         shown = "1 finished run keeps its" if hidden == 1 else f"{hidden} finished runs keep their"
-        notices.append(notice(f"{shown} hidden scores until no agent of a related run is alive."))
+        notices.append(Notice(f"{shown} hidden scores until no agent of a related run is alive."))
     if waits := Counter(run.waits_for for run in every if run.waits_for):
         lines = [f"{counted(n, 'run')}: {reason}" for reason, n in waits.most_common(12)]
-        notices.append(notice("Runs wait", lines))
+        notices.append(Notice("Runs wait", lines))
     for root in roots:
         try:
             disk = shutil.disk_usage(root)
         except OSError as error:
-            notices.append(notice(f"{root} cannot be read: {error.strerror}"))
+            notices.append(Notice(f"{root} cannot be read: {error.strerror}"))
             continue
         if disk.free < disk.total * 0.05:
-            notices.append(notice(f"The disk of {root} is nearly full: {bytes_text(disk.free)} are free."))
+            notices.append(Notice(f"The disk of {root} is nearly full: {bytes_text(disk.free)} are free."))
     if not every:
-        notices.append(notice("No run was found yet. New ones appear here by themselves."))
+        notices.append(Notice("No run was found yet. New ones appear here by themselves."))
     return notices
 
 
-def _matrix(sweep: Sweep, runs: Runs, agents: Mapping[str, Look], most: int) -> tuple[dict[str, Any], int]:
+def _matrix(name: str, sweep: Sweep, runs: Runs, agents: Mapping[str, Look], most: int) -> tuple[str, int]:
     cells: dict[tuple[str, str], list[RunFacts]] = {}
     shown = sorted(sweep.runs, key=lambda run: (_order(run)[0], run.repeat))[:most]
     for run in shown:
@@ -132,20 +133,22 @@ def _matrix(sweep: Sweep, runs: Runs, agents: Mapping[str, Look], most: int) -> 
         for entry in entries
     ]
     by_state = {run.state: run for run in shown}
-    view = {
-        "name": sweep.name,
-        "folder": "" if sweep.root is None else str(sweep.root),
-        "legend": [
+    matrix = part(
+        "matrix",
+        ident=name,
+        name=sweep.name,
+        folder="" if sweep.root is None else str(sweep.root),
+        legend=[
             {"symbol": symbol, "kind": _kind(by_state[state]), "words": words}
             for state, (symbol, words) in STATES.items()
             if state in by_state
         ],
-        "envs": [(env, title_of(env)) for env in envs],
-        "rows": rows,
-        "left_out": len(sweep.runs) - len(shown),
-        "paused": sweep.paused,
-    }
-    return view, most - len(shown)
+        envs=[(env, title_of(env)) for env in envs],
+        rows=rows,
+        left_out=len(sweep.runs) - len(shown),
+        paused=sweep.paused,
+    )
+    return matrix, most - len(shown)
 
 
 def _chip(run: RunFacts, may_show: bool) -> dict[str, Any]:
