@@ -205,6 +205,9 @@ class ExperimentDimensions(AllConditions, frozen=True, kw_only=True):
     agents_md: str = ""
     """SHA-256 (`sha256:…`) of the operator's text in place of `AGENTS.md`; empty: the standard text."""
 
+    def n_cases(self, split: Split) -> int:
+        return {"train": self.n_train, "validation": self.n_validation, "heldout": self.n_heldout}[split]
+
 
 class Timing(msgspec.Struct, frozen=True, kw_only=True):
     """How the wall time was spent. The phases need not add up to `wall_time_seconds`."""
@@ -364,7 +367,8 @@ class Versions(msgspec.Struct, frozen=True, kw_only=True):
 
     def file_hash(self, split: Split) -> str:
         """The hash of a split's case file; of its cases if there is none."""
-        return str(getattr(self, f"data_{_DATA[split]}_hash"))
+        train, heldout = self.data_train_hash, self.data_heldout_hash
+        return {"train": train, "validation": self.data_valid_hash, "heldout": heldout}[split]
 
 
 class RunSummary(msgspec.Struct, frozen=True, kw_only=True):
@@ -504,6 +508,3 @@ def decode_run_record(data: bytes) -> RunRecord:
 def sha256_text(digest: str) -> str:
     """A hash in the form of `versions`, from its hex digits; empty for an unknown one."""
     return f"sha256:{digest}" if digest else ""
-
-
-_DATA: dict[Split, str] = {"train": "train", "validation": "valid", "heldout": "heldout"}

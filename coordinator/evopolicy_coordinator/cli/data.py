@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import secrets
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import msgspec
 import typer
@@ -26,6 +26,7 @@ from evopolicy_common.records.blobs import write_atomically
 from evopolicy_common.terminal import counted, say
 from evopolicy_coordinator import splits, worlds
 
+_Report = tuple[Path, splits.EnvironmentSplits | None, list[str]]
 MAX_TRAIN = 1_000_000
 """As many as `--cases` can name."""
 
@@ -116,40 +117,31 @@ def check(
     if not folders:
         fail(f"no train.json, valid.json or heldout.json in {folder} or in its folders")
     reports = [_report(item.resolve()) for item in folders]
-    faulty = any(report["findings"] for report in reports)
     _print(reports)
-    if faulty:
+    if any(findings for _, _, findings in reports):
         raise typer.Exit(1)
 
 
-def _report(folder: Path) -> dict[str, Any]:
+def _report(folder: Path) -> _Report:
     loaded, findings = splits.load(folder)
-    if loaded is None:
-        return {"folder": str(folder), "env": None, "findings": findings}
-    if loaded.env not in catalogue.entries():
+    if loaded is not None and loaded.env not in catalogue.entries():
         findings.append(f"{folder.name}: {loaded.env!r} is not in the catalogue")
-    return {
-        "folder": str(folder),
-        "env": loaded.env,
-        "cases": {split: len(loaded.cases(split)) for split in split_files.SPLITS},
-        "sha256": loaded.hashes(),
-        "secret": loaded.secret,
-        "findings": findings,
-    }
+    return folder, loaded, findings
 
 
-def _print(reports: list[dict[str, Any]]) -> None:
+def _print(reports: list[_Report]) -> None:
     shown = table("environment", "train", "valid", "heldout", "secret", "sha256 of each", "checks")
-    for report in reports:
-        verdict = counted(len(report["findings"]), "finding") if report["findings"] else "ok"
-        if report["env"] is None:
-            shown.add_row(Path(report["folder"]).name, "", "", "", "", "", verdict)
+    for folder, loaded, findings in reports:
+        verdict = counted(len(findings), "finding") if findings else "ok"
+        if loaded is None:
+            shown.add_row(folder.name, "", "", "", "", "", verdict)
             continue
-        counts = [str(report["cases"][split]) for split in split_files.SPLITS]
-        hashes = " ".join(report["sha256"][split][:8] for split in split_files.SPLITS)
-        shown.add_row(report["env"], *counts, "yes" if report["secret"] else "no", hashes, verdict)
+        counts = [str(len(loaded.cases(split))) for split in split_files.SPLITS]
+        sha256 = loaded.hashes()
+        hashes = " ".join(sha256[split][:8] for split in split_files.SPLITS)
+        shown.add_row(loaded.env, *counts, "yes" if loaded.secret else "no", hashes, verdict)
     console = terminal()
     console.print(shown)
-    for report in reports:
-        for finding in report["findings"]:
+    for _, _, findings in reports:
+        for finding in findings:
             console.print(finding, style="red", soft_wrap=True)

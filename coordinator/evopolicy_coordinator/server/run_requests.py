@@ -329,10 +329,11 @@ class RunRequests:
         if min(1 if n is None else n for n in (n_validation, n_heldout)) < 1:
             raise ConfigError("a run needs at least one validation and one held-out case")
         suite = catalogue.suite_of(env)
-        wanted: dict[Split, int | None] = {"train": None, "validation": n_validation, "heldout": n_heldout}
+        wanted: dict[Split, int | None] = {"validation": n_validation, "heldout": n_heldout}
+        counts: dict[Split, int] = {}
         if not self._source.from_files:
-            wanted = {split: getattr(suite, f"n_{split}") if n is None else n for split, n in wanted.items()}
-        counts = {split: n for split, n in wanted.items() if n is not None}
+            counts = {"train": suite.n_train, "validation": suite.n_validation, "heldout": suite.n_heldout}
+        counts |= {split: n for split, n in wanted.items() if n is not None}
         return self._source.splits(suite.name, env, counts, own)
 
 

@@ -396,7 +396,7 @@ def train_run(group: str) -> str | None:
     return (head.rpartition("/")[0] or None) if kind == "train" else None
 
 
-def named_blobs(row: Any) -> Iterable[str]:
+def named_blobs(row: records.Row) -> Iterable[str]:
     """Digests of the blobs that a row names without carrying their bytes."""
     if isinstance(row, records.SubmitRow | records.EvaluationRow) and row.bundle is not None:
         yield row.bundle

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from functools import partial
 from importlib import import_module
-from typing import Any
 
 import msgspec
 
@@ -44,7 +43,7 @@ def drawings_of(study: Study) -> list[partial[Plot | None]]:
     ] + [partial(_draw, name, sent, look) for name in _OF_STUDY]
 
 
-def _draw(function: str, *args: Any) -> Plot | None:
+def _draw(function: str, *args: object) -> Plot | None:
     module, _, name = function.partition(".")
     plot: Plot | None = getattr(import_module(f"{__name__}.{module}"), name)(*args)
     return plot

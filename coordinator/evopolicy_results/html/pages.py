@@ -7,6 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from importlib.resources import files
 from typing import Any, NamedTuple
 
+import msgspec
 from markupsafe import Markup, escape
 
 from evopolicy_common.records.run_record import Replay
@@ -46,7 +47,7 @@ class _Section(NamedTuple):
 
 
 _PLAN = files("evopolicy_results.html").joinpath("templates", "sections.toml").read_text("utf-8")
-_SECTIONS = [_Section(**about) for about in tomllib.loads(_PLAN)["section"]]
+_SECTIONS = msgspec.convert(tomllib.loads(_PLAN)["section"], list[_Section])
 
 
 def index_page(

@@ -20,6 +20,7 @@ from evopolicy_results.publish import contents, fields
 from evopolicy_results.publish.contents import Group, Listed, Removed
 
 T = TypeVar("T")
+OfRun = TypeVar("OfRun", journal.Opened, journal.Ended)
 
 KINDS = {
     "format": "the format is one that this version reads",
@@ -195,11 +196,9 @@ class History(NamedTuple):
     entries: list[journal.EpochEntry]
     heads: list[str]
 
-    def entry(self, kind: type[T], run: str) -> tuple[int, T] | None:
+    def entry(self, kind: type[OfRun], run: str) -> tuple[int, OfRun] | None:
         entries = enumerate(self.entries)
-        return next(
-            ((n, one) for n, one in entries if isinstance(one, kind) and getattr(one, "run", "") == run), None
-        )
+        return next(((n, one) for n, one in entries if isinstance(one, kind) and one.run == run), None)
 
 
 def decoded(name: str, data: bytes, kind: Callable[..., T] | type[T]) -> T:

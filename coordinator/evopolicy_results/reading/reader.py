@@ -103,7 +103,7 @@ def reconciled(runs: Sequence[Run]) -> tuple[Run, ...]:
     used: dict[tuple[Split, str], dict[str, set[int]]] = {}
     for run, split in itertools.product(runs, SPLITS):
         if not run.is_published:
-            versions, n = run.record.versions, getattr(run.record.experiment_dimensions, f"n_{split}")
+            versions, n = run.record.versions, run.record.experiment_dimensions.n_cases(split)
             by_cases = used.setdefault((split, versions.file_hash(split)), {})
             by_cases.setdefault(versions.cases_hash(split), set()).add(n)
 
@@ -111,7 +111,7 @@ def reconciled(runs: Sequence[Run]) -> tuple[Run, ...]:
         agent, versions = run.record.agent, run.record.versions
         hashes = dict(versions.cases_hashes)
         for split in SPLITS:
-            n = getattr(run.record.experiment_dimensions, f"n_{split}")  # 0 if unknown
+            n = run.record.experiment_dimensions.n_cases(split)  # 0 if unknown
             # Several runs of ours may have used different numbers of cases of the file.
             by_cases = used.get((split, versions.file_hash(split)), {})
             fitting = [cases for cases, counts in by_cases.items() if not n or n in counts]

@@ -8,17 +8,18 @@ Tol's; after nine agents colours repeat with another dash. The random reference 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import msgspec
 
+Dash = str | tuple[int, tuple[float, ...]]
+"""A line style of matplotlib."""
 REFERENCE = "#868b92"
 
 COLOURS = (
     "#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9",
     "#aa4499", "#999933", "#882255",
 )  # fmt: skip
-DASHES: tuple[Any, ...] = ("-", (0, (5, 1.5)), (0, (1.5, 1)), (0, (6, 1.5, 1.5, 1.5)))
+DASHES: tuple[Dash, ...] = ("-", (0, (5, 1.5)), (0, (1.5, 1)), (0, (6, 1.5, 1.5, 1.5)))
 
 EDIT_COLOURS = {"first": "#b9bec6", "synthesis": "#7b6fd0", "parametric": "#c9a227", "data": "#5f9e98"}
 """Colours of the timelines' bands; no agent uses them."""
@@ -45,7 +46,7 @@ class Look(msgspec.Struct, frozen=True, kw_only=True):
 
     colour: str
     marker: str
-    dash: Any
+    dash: Dash
 
     @property
     def path(self) -> str:

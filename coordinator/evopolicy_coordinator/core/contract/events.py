@@ -12,7 +12,7 @@ Rules that this module owns:
 
 from __future__ import annotations
 
-from typing import Any, Generic, TypeVar
+from typing import Generic, TypeVar
 
 import msgspec
 
@@ -86,4 +86,4 @@ class DescriptionAwaited(Event, frozen=True, kw_only=True):
     env: str
 
 
-AnyEvent = Requested[Any] | LivenessLost | DescriptionAwaited
+AnyEvent = Requested[Message] | LivenessLost | DescriptionAwaited

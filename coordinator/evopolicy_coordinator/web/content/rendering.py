@@ -13,6 +13,7 @@ from urllib.parse import urlencode
 import msgspec
 from jinja2 import ChoiceLoader, Environment, PackageLoader
 
+from evopolicy_common.cli.conventions import bytes_text
 from evopolicy_common.records.words import in_words
 from evopolicy_common.terminal import short
 from evopolicy_coordinator.web.content.run_folders import key_of
@@ -51,6 +52,7 @@ def _environment() -> Environment:
     own = shared.overlay(loader=ChoiceLoader(loaders))
     own.filters = {
         **shared.filters,
+        "bytes": bytes_text,
         "short": short,
         "state": state_words,
         "priority": lambda name: _PRIORITIES.get(name, name),
@@ -108,18 +110,19 @@ def ident(*texts: str) -> str:
 
 
 def paged(
-    every: Iterable[T], words: Words, texts: Callable[[T], Iterable[str]]
-) -> tuple[Sequence[T], dict[str, Any]]:
+    every: Iterable[T], words: Words, texts: Callable[[T], Iterable[str]], what: str
+) -> tuple[Sequence[T], str]:
     """The rows of the page that `words` select, and the page's place. `texts`: of a row, for the search."""
     wanted = words.q.lower().split()
     rows = [row for row in every if all(word in " ".join(texts(row)).lower() for word in wanted)]
     last = max(0, (len(rows) - 1) // PAGE_ROWS)
     at = min(max(0, words.page), last)
-    view = {
+    place = {
         "first": at * PAGE_ROWS + 1 if rows else 0,
         "last": min(len(rows), (at + 1) * PAGE_ROWS),
         "total": len(rows),
         "previous": words.link(page=at - 1) if at else "",
         "next": words.link(page=at + 1) if at < last else "",
     }
-    return rows[at * PAGE_ROWS : (at + 1) * PAGE_ROWS], view
+    shown = part("pages", ident=f"{what}-pages", what=f"{what}s", pages=place)
+    return rows[at * PAGE_ROWS : (at + 1) * PAGE_ROWS], shown

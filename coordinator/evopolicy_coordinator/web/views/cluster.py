@@ -6,9 +6,7 @@ import contextlib
 import shutil
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
-from evopolicy_common.cli.conventions import bytes_text
 from evopolicy_common.messages.status import DiskUse, StatusReply, WorkerStatus
 from evopolicy_common.terminal import duration, short
 from evopolicy_coordinator.web.content.cluster import Cluster
@@ -34,14 +32,14 @@ def cluster_view(cluster: Cluster, words: Words, runs: Runs, roots: Sequence[Pat
     by_run = {run.run: run for run in runs.by_key.values() if run.run}
     names = {run.run: f"{run.entry} on {title_of(run.env)}" for run in status.runs}
     workers = sorted(status.workers, key=lambda one: (one.state == "active", one.worker))
-    shown, pages = paged(workers, words, _row_texts)
+    shown, pages = paged(workers, words, _row_texts, "worker")
     view.parts |= {
         "facts": part("facts", facts=_cluster_facts(status) if cluster.status else []),
         "notices": part("notices", notices=_cluster_notices(cluster, status)),
         "queue": part("queue", rows=status.queue[:PAGE_ROWS], left_out=len(status.queue[PAGE_ROWS:])),
         "disks": part("disks", disks=_disks(status.disk, roots)),
         "classes": part("classes", classes=sorted(classes.items())),
-        "worker-pages": part("pages", ident="worker-pages", what="workers", pages=pages),
+        "worker-pages": pages,
     }
     for worker in shown:
         plays = _plays(worker, names, by_run)
@@ -87,24 +85,14 @@ def _cluster_notices(cluster: Cluster, status: StatusReply) -> list[Notice]:
     return notices
 
 
-def _disks(of_coordinator: DiskUse | None, roots: Sequence[Path]) -> list[dict[str, Any]]:
-    """Size and free space of the disks that fill up while runs are played."""
+def _disks(of_coordinator: DiskUse | None, roots: Sequence[Path]) -> list[tuple[str, str, DiskUse]]:
+    """Machine, folder and space of the disks that fill up while runs are played."""
     disks = [] if of_coordinator is None else [("coordinator", "its state folder", of_coordinator)]
     for root in roots:
         with contextlib.suppress(OSError):  # the page of all runs names a folder that cannot be read
             disk = shutil.disk_usage(root)
             disks.append(("this host", str(root), DiskUse(database=0, free=disk.free, total=disk.total)))
-    return [
-        {
-            "where": where,
-            "folder": folder,
-            "database": bytes_text(disk.database) if disk.database else "",
-            "free": bytes_text(disk.free),
-            "total": bytes_text(disk.total),
-            "share": 1.0 - disk.free / max(1, disk.total),
-        }
-        for where, folder, disk in disks
-    ]
+    return disks
 
 
 def _plays(

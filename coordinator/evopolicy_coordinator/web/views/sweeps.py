@@ -32,11 +32,11 @@ def sweeps_view(runs: Runs, cluster: Cluster | None, words: Words, roots: Sequen
         name = ident("sweep", str(sweep.root))
         matrix, cells = _matrix(name, sweep, runs, agents, cells)
         view.row("matrices", name, matrix)
-    shown, pages = paged(sorted(every, key=_order), words, _row_texts)
+    shown, pages = paged(sorted(every, key=_order), words, _row_texts, "run")
     view.parts |= {
         "facts": part("facts", facts=_sweep_facts(every)),
         "notices": part("notices", notices=_run_notices(runs, every, cluster, roots)),
-        "run-pages": part("pages", ident="run-pages", what="runs", pages=pages),
+        "run-pages": pages,
     }
     for run in shown:
         may_show = runs.may_show(run)
