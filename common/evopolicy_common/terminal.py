@@ -14,7 +14,7 @@ import re
 import signal
 import sys
 from collections.abc import Iterable, Mapping
-from typing import TYPE_CHECKING, Any, TextIO
+from typing import TYPE_CHECKING, TextIO
 
 from evopolicy_common.installation import as_called
 
@@ -48,7 +48,7 @@ def shortened(text: str) -> str:
 _NUMBERS = re.compile(r"[-+]?[0-9][0-9.]*(?:e[-+]?[0-9]+)?(?: to [-+]?[0-9][0-9.]*(?:e[-+]?[0-9]+)?)?")
 
 
-def csv_cell(value: object) -> Any:
+def csv_cell(value: object) -> object:
     """The value for a CSV file: empty for None; texts `harmless`, an apostrophe before formulas."""
     if value is None:
         return ""
@@ -59,7 +59,7 @@ def csv_cell(value: object) -> Any:
     return f"'{text}" if formula else text
 
 
-def event_text(event: str, values: Mapping[str, Any]) -> str:
+def event_text(event: str, values: Mapping[str, object]) -> str:
     """An event of a log as people read it: `slot was stopped from outside (2 s): …`. Values named `why`,
     `error` or `detail` are its reason, seconds (`…_s`) need no name, and empty ones are left out."""
     given = {name: value for name, value in values.items() if value not in ("", None)}

@@ -84,7 +84,7 @@ def write_report(
         for run in runs
     ]
     plots: list[Plot] = []
-    submits: list[dict[str, Any]] = []
+    submits: list[dict[str, object]] = []
     stages: list[partial[Any]] = [*drawings, *pages]
     work = [(names_in_runs, each) for each in stages]
     for done, made in enumerate(processes.map(_made, work, _lost, at_once=1), start=1):
@@ -143,7 +143,7 @@ def _made(item: tuple[dict[str, set[tuple[str, str]]], partial[object]]) -> Any:
     return drawn(made)
 
 
-def _lost(item: tuple[object, partial[object]], why: str) -> Any:
+def _lost(item: tuple[object, partial[object]], why: str) -> object:
     """Replaces a run's page whose process ended; a figure has nothing of an agent's that could end its process."""
     if item[1].func is not _page:
         raise ChildProcessError(why)
@@ -153,7 +153,7 @@ def _lost(item: tuple[object, partial[object]], why: str) -> Any:
 
 def _page(
     run: Run, out: Path, look: Look | None, beside: Sequence[tuple[str, Look | None, str]]
-) -> list[dict[str, Any]]:
+) -> list[dict[str, object]]:
     """Writes the page of a run, with its images and videos beside it, and returns its submits."""
     name, folder = slug(run), out / "traces"
     image_links: dict[int, list[tuple[str, str]]] = {}
@@ -175,7 +175,7 @@ def _page(
         return _write_failed(run, out, f"{type(error).__name__}: {error}")
 
 
-def _write_failed(run: Run, out: Path, why: str) -> list[dict[str, Any]]:
+def _write_failed(run: Run, out: Path, why: str) -> list[dict[str, object]]:
     write_file(out / "traces" / f"{slug(run)}.html", page("failed", title=run_title(run), reason=why))
     return []
 

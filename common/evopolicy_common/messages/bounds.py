@@ -40,7 +40,7 @@ Plain = Annotated[dict[str, Any], Meta(max_length=1 << 16, extra={"plain": True}
 
 def check_plausible(record: T) -> T:
     """Returns the record. Raises ValueError for a field with a number beyond `LARGEST`, which JSON allows."""
-    queue: list[tuple[str, Any]] = [("", to_builtins(record))]
+    queue: list[tuple[str, object]] = [("", to_builtins(record))]
     while queue:
         name, value = queue.pop()
         if isinstance(value, dict):

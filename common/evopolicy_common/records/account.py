@@ -6,8 +6,6 @@ the committed documents and compare. `Claims` lists all that neither document de
 
 from __future__ import annotations
 
-from typing import Any
-
 import msgspec
 
 from evopolicy_common.messages.environment import Split
@@ -155,7 +153,7 @@ def outcome(result: RunResult, claims: Claims) -> schema.Outcome:
     completed, code = result.status == "completed", claims.code
     heldout, reference = result.heldout_returns, result.random_heldout_returns
     best = result.best_submit_index if completed else None
-    auxiliary: dict[str, Any] = {
+    auxiliary: dict[str, object] = {
         "code_metrics_best": None if best is None else code.get(best),
         "code_metrics_by_submit": {str(index): metrics for index, metrics in code.items()},
         "code_metrics_trend": {

@@ -156,7 +156,7 @@ class Database(abc.ABC):
         """Returns a DB-API cursor."""
 
     @abc.abstractmethod
-    def execute_many(self, statement: str, rows: list[tuple[Any, ...]]) -> None:
+    def execute_many(self, statement: str, rows: list[tuple[object, ...]]) -> None:
         """Executes the statement with each row."""
 
     @abc.abstractmethod
@@ -224,13 +224,13 @@ class Sqlite(Database):
                 self.raw.close()
                 raise
 
-    def execute(self, statement: str, args: Iterable[Any] = ()) -> sqlite3.Cursor:
+    def execute(self, statement: str, args: Iterable[object] = ()) -> sqlite3.Cursor:
         return self.raw.execute(statement, tuple(args))
 
-    def execute_many(self, statement: str, rows: list[tuple[Any, ...]]) -> None:
+    def execute_many(self, statement: str, rows: list[tuple[object, ...]]) -> None:
         self.raw.executemany(statement, rows)
 
-    def stream(self, statement: str, args: Iterable[Any] = ()) -> Iterator[tuple[Any, ...]]:
+    def stream(self, statement: str, args: Iterable[object] = ()) -> Iterator[tuple[object, ...]]:
         return iter(self.raw.execute(statement, tuple(args)))
 
     def has_table(self, name: str) -> bool:
@@ -291,10 +291,10 @@ class Postgres(Database):
     def execute(self, statement: str, args: Iterable[Any] = ()) -> psycopg.Cursor[tuple[Any, ...]]:
         return self._open.execute(_theirs(statement), tuple(args))
 
-    def execute_many(self, statement: str, rows: list[tuple[Any, ...]]) -> None:
+    def execute_many(self, statement: str, rows: list[tuple[object, ...]]) -> None:
         self._open.cursor().executemany(_theirs(statement), rows)
 
-    def stream(self, statement: str, args: Iterable[Any] = ()) -> Iterator[tuple[Any, ...]]:
+    def stream(self, statement: str, args: Iterable[object] = ()) -> Iterator[tuple[object, ...]]:
         return self._open.cursor().stream(_theirs(statement), tuple(args))
 
     def batch(self) -> contextlib.AbstractContextManager[Any]:

@@ -323,7 +323,7 @@ class Reader:
         """As of `Store`; None also for an empty database."""
         return _sealed(self._db)
 
-    def _page(self, kind: type[T], where: str, args: tuple[Any, ...], max_bytes: int) -> tuple[T, ...]:
+    def _page(self, kind: type[T], where: str, args: tuple[object, ...], max_bytes: int) -> tuple[T, ...]:
         """Rows of up to `max_bytes`, but at least one if there is any."""
         place = _PLACES[kind]
         sizes = f"SELECT LENGTH({place.column}) FROM {place.table} {where} LIMIT {_PAGE_ROWS}"
@@ -336,7 +336,7 @@ class Reader:
         self._db.close()
 
 
-def rows(db: Database, kind: type[T], where: str = "", args: tuple[Any, ...] = ()) -> Iterator[T]:
+def rows(db: Database, kind: type[T], where: str = "", args: tuple[object, ...] = ()) -> Iterator[T]:
     """The rows of a kind; until they are exhausted, `db` does nothing else. Raises DamagedStoreError with the
     unreadable row's key."""
     place = _PLACES[kind]

@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from functools import cache
 from importlib.resources import files
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
@@ -29,11 +29,11 @@ class Notice(NamedTuple):
     lines: Sequence[str] = ()
 
 
-def section(ident: str, nav: str, *, title: str = "", ask: str = "", **parts: Any) -> dict[str, Any]:
+def section(ident: str, nav: str, *, title: str = "", ask: str = "", **parts: object) -> dict[str, object]:
     """A section of a front page. `nav`: its name in the navigation, and its heading unless `title` is given. `ask`: the
     question that it answers; the section is folded until it is asked for. Without one it is open."""
     lists = ("figures", "tables", "texts", "links", "picker", "reasons")
-    empty: dict[str, Any] = {**{name: [] for name in lists}, "reasons_title": "", "code": ""}
+    empty: dict[str, object] = {**{name: [] for name in lists}, "reasons_title": "", "code": ""}
     return {**empty, "id": ident, "nav": nav, "title": title or nav, "ask": ask, **parts}
 
 
@@ -57,7 +57,7 @@ def environment() -> Environment:
     return made
 
 
-def part(name: str, /, **values: Any) -> str:
+def part(name: str, /, **values: object) -> str:
     """The HTML of one part of a run's page, by the macro that makes it."""
     return str(getattr(environment().get_template("run_parts.html.j2").module, name)(**values))
 
@@ -83,7 +83,7 @@ class View:
         return [*self.lists, *(name for name in self.parts if name not in listed)]
 
 
-def page(template: str, *, view: View | None = None, own: Environment | None = None, **values: Any) -> str:
+def page(template: str, *, view: View | None = None, own: Environment | None = None, **values: object) -> str:
     """A page from the template of that name. In it `part(name)` and `listed(name)` put the view's parts, where it has
     them. `own`: the environment, unless it is the report's."""
     shown = view or View()

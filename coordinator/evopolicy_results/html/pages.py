@@ -76,7 +76,7 @@ def index_page(
             for name in ([each[:-1] + suite for suite in suites] if "*" in each else [each])
         ]
 
-    parts: dict[str, dict[str, Any]] = {
+    parts: dict[str, dict[str, object]] = {
         each.ident: {
             "figures": [by_name[name] for name in named(each.figures) if name in by_name],
             "tables": [views[name] for name in named(each.tables) if name in views],
@@ -162,7 +162,7 @@ def table_view(table: Table, pages: Mapping[str, str] = {}) -> dict[str, Any]:
     }
 
 
-def _cell(column: Column, value: object, mark: int, page_of_run: str | None, text: str) -> dict[str, Any]:
+def _cell(column: Column, value: object, mark: int, page_of_run: str | None, text: str) -> dict[str, object]:
     numeric = column.kind != "text"
     is_long = not numeric and len(str(value)) > _LONG
     classes = {"n": numeric, "first": mark == 1, "second": mark == 2}
@@ -234,9 +234,9 @@ def trace_page(
     )
 
 
-def _checkpoints(trace: Trace) -> dict[str, dict[str, Any]]:
+def _checkpoints(trace: Trace) -> dict[str, dict[str, object]]:
     """By label: the first checkpoint with the same files, and what changed since the one before."""
-    out: dict[str, dict[str, Any]] = {}
+    out: dict[str, dict[str, object]] = {}
     previous: dict[str, str] | None = None
     labels: dict[str, str] = {}
     for submit in trace.run.submits:

@@ -14,7 +14,7 @@ import shlex
 import shutil
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import msgspec
 
@@ -78,7 +78,7 @@ def _write_pages(bundles: Sequence[LabBundle], out: Path, title: str, tell: Tell
     all_boards = boards(bundles)
     for bundle in bundles:
         write_file(out / bundle.page, _bundle_page(bundle))
-    sections: list[dict[str, Any]] = []
+    sections: list[dict[str, object]] = []
     entries: set[str] = set()
     reference: str | None = None
     runs: list[tuple[Cell, ...]] = []
@@ -161,7 +161,7 @@ def _check(out: Path) -> None:
     check_folder(out, lambda name: is_site and (name in names or name.startswith("board-")), "site")
 
 
-def _board(board: Board, study: Study, number: int, folder: str) -> dict[str, Any]:
+def _board(board: Board, study: Study, number: int, folder: str) -> dict[str, object]:
     views = []
     for table in tables_of(study):
         if table.name in _SHOWN:
@@ -260,7 +260,7 @@ def _episodes(run: Run, bundle: LabBundle, run_page: str) -> str:
     )
 
 
-def _checking(bundles: Sequence[LabBundle]) -> dict[str, Any]:
+def _checking(bundles: Sequence[LabBundle]) -> dict[str, object]:
     lines = [
         f"evopolicy check {shlex.quote(each.file)}{f' --identity {each.signer}' * bool(each.signer)} --replay 5%"
         for each in bundles
@@ -303,7 +303,7 @@ def _notices(bundles: Sequence[LabBundle]) -> list[Notice]:
 
 def _table(
     ident: str, title: str, caption: str, columns: str, rows: Sequence[tuple[Cell, ...]]
-) -> dict[str, Any]:
+) -> dict[str, object]:
     """A table for the page; cells that are numbers sort as numbers. `columns`: their titles."""
     cells = [list(map(_cell, row)) for row in rows]
     return {
@@ -322,7 +322,7 @@ def _table(
     }
 
 
-def _cell(cell: Cell) -> dict[str, Any]:
+def _cell(cell: Cell) -> dict[str, object]:
     text = cell.text if isinstance(cell, Link) else f"{cell:.4g}" if isinstance(cell, float) else str(cell)
     value = cell if isinstance(cell, int | float) else None
     return {

@@ -8,7 +8,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Mapping
 from importlib import resources
-from typing import Any, NamedTuple, get_args, get_type_hints
+from typing import NamedTuple, get_args, get_type_hints
 
 import msgspec
 
@@ -131,7 +131,7 @@ def _values(values: Mapping[str, int], n_runs: int) -> str:
     return ", ".join(f"{value} ({n})" if n < n_runs else value for value, n in listed[:_SHOWN]) + more
 
 
-def croissant(card: Card, digests: Mapping[str, str], file: File | None = None) -> dict[str, Any]:
+def croissant(card: Card, digests: Mapping[str, str], file: File | None = None) -> dict[str, object]:
     """`croissant.json`. `digests`: of the published files, by name. `file`: describes them as contained in
     it; else as they are beside the description when it is unpacked."""
     contained = {} if file is None else {"containedIn": {"@id": file.name}}
@@ -168,15 +168,15 @@ def croissant(card: Card, digests: Mapping[str, str], file: File | None = None) 
     return {**shared, **own, **({"license": card.licence} if card.licence else {})}
 
 
-def _node(kind: str, place: str, name: str) -> dict[str, Any]:
+def _node(kind: str, place: str, name: str) -> dict[str, object]:
     return {"@type": kind, "@id": place, "name": name}
 
 
-def _file(name: str, text: str, sha256: str) -> dict[str, Any]:
+def _file(name: str, text: str, sha256: str) -> dict[str, object]:
     return {**_node("cr:FileObject", name, name), "description": text, "contentUrl": name, "sha256": sha256}
 
 
-def _field(name: str) -> dict[str, Any]:
+def _field(name: str) -> dict[str, object]:
     kind = get_type_hints(RunSummary)[name]
     kind = next(text for of, text in _DATA_TYPES.items() if of in (kind, *get_args(kind)))
     source = {"fileObject": {"@id": contents.CARD}, "extract": {"jsonPath": f"$.runs[*].{name}"}}

@@ -118,7 +118,7 @@ def file_kind(name: str) -> str | None:
     return next((kind for kind in FIELDS if "*" in kind and _FILES[kind].fullmatch(name)), None)
 
 
-def leaves(value: object, path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Any]]:
+def leaves(value: object, path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], object]]:
     """The paths of all numbers, texts, truth values and nulls in JSON."""
     if isinstance(value, dict | list):
         items = value.items() if isinstance(value, dict) else enumerate(value)
@@ -136,7 +136,7 @@ def unknown_and_claims(name: str, value: object, told: bool = False) -> tuple[li
     unknown: dict[str, None] = {}
     claims: dict[str, None] = {}
     for path, leaf in leaves(value):
-        node, below = tree, dict[str, Any]()
+        node, below = tree, dict[str, object]()
         for part in path:
             below = node.get("**", below)
             node = node.get(part) or node.get("*") or {}

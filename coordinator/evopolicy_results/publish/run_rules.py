@@ -5,7 +5,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from itertools import zip_longest
-from typing import Any
 
 import msgspec
 
@@ -417,7 +416,7 @@ def _metrics(run: PublishedRun, policies: dict[int, Bundle], checked: Checked) -
     by_submit = run.record.outcome.auxiliary.get(_BY_SUBMIT, {})
     file = f"{run.folder}/{contents.RUN}"
     wanted = [str(submit.submit_index) for submit in run.result.submits]
-    pairs: list[tuple[str, Any, Any]] = [(_BY_SUBMIT, list(by_submit), wanted)]
+    pairs: list[tuple[str, object, object]] = [(_BY_SUBMIT, list(by_submit), wanted)]
     try:
         for index, here in by_submit.items():
             where = f"outcome.auxiliary.{_BY_SUBMIT}.{index}"

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 from msgspec.structs import replace
 
 from evopolicy_common import catalogue
@@ -77,7 +75,7 @@ def _aggregate(suite: Suite, study: Study) -> Table:
     budgets = {entry: one_or_all(sorted(run.budget for run in runs)) for entry, runs in by_entry.items()}
     whole = suite_size(suite.name) or len(suite.table.environments)
     standings = suite.statistics.standings
-    rows: list[dict[str, Any]] = []
+    rows: list[dict[str, object]] = []
     for row in suite.board.standings:
         known = [
             on_known_scale(suite.board.cells[row.entry, env].mean, env) for env in suite.table.environments
@@ -168,11 +166,11 @@ def _incomplete(suite: Suite) -> Table:
 
 
 def _heldout(suite: Suite) -> Table:
-    rows: list[dict[str, Any]] = []
+    rows: list[dict[str, object]] = []
     marks: dict[tuple[int, str], int] = {}
     digits: dict[tuple[int, str], int] = {}
     for i, standing in enumerate([*suite.board.standings, *suite.board.incomplete]):
-        row: dict[str, Any] = {"entry": standing.entry, "harness": standing.harness}
+        row: dict[str, object] = {"entry": standing.entry, "harness": standing.harness}
         for env in suite.table.environments:
             if (cell := suite.board.cells.get((standing.entry, env))) is not None:
                 row[env] = cell.mean
@@ -239,7 +237,7 @@ def _normalised(suite: Suite) -> Table:
     agents = suite.table.agents
     cells = suite.normalised.cells
     groups = {(group.entry, group.demand): group for group in suite.normalised.groups}
-    rows: list[dict[str, Any]] = []
+    rows: list[dict[str, object]] = []
     bold: dict[tuple[int, str], int] = {}
     for demand in (*DEMANDS, None):
         envs = [env for env in suite.table.environments if demand_of(env) == demand]

@@ -88,7 +88,7 @@ def tables_of_runs(study: Study) -> list[Table]:
     ]
 
 
-def one_or_all(values: Iterable[object]) -> Any:
+def one_or_all(values: Iterable[object]) -> object:
     """The common value of all, or `A or B` if different runs were mixed; None without any."""
     distinct = list(dict.fromkeys(values))
     return distinct[0] if len(distinct) == 1 else " or ".join(map(str, distinct)) or None
@@ -152,10 +152,10 @@ def _settings(run: Run) -> str:
 def _environments(runs: Iterable[Run]) -> Table:
     by_env = grouped(runs, lambda run: run.env)
 
-    def common(key: str, title: str, kind: Kind, of: Callable[[Run], Any], note: str = "") -> Column:
+    def common(key: str, title: str, kind: Kind, of: Callable[[Run], object], note: str = "") -> Column:
         return Column(key, title, kind, note=note, of=lambda env: one_or_all(map(of, by_env[env])))
 
-    def dimension(name: str) -> Callable[[Run], Any]:
+    def dimension(name: str) -> Callable[[Run], object]:
         return lambda run: getattr(run.record.experiment_dimensions, name) or None
 
     def spaces(env: str) -> str | None:
@@ -225,7 +225,7 @@ _FEEDBACK = (
 )
 
 
-def submits_of(trace: Trace) -> list[dict[str, Any]]:
+def submits_of(trace: Trace) -> list[dict[str, object]]:
     """A run's rows of the table of feedback use."""
     run, transitions, evidence = trace.run, trace.transitions, trace.evidence
     submits = [
@@ -239,7 +239,7 @@ def _quote(evidence: Evidence) -> str:
     return quote if len(quote) <= _MAX_QUOTE else quote[: _MAX_QUOTE - 1] + "…"
 
 
-def feedback_use(rows: Iterable[dict[str, Any]]) -> Table:
+def feedback_use(rows: Iterable[dict[str, object]]) -> Table:
     """Every submit of every run (`submits_of`). Too long for a page; each run has a page of its own."""
     return Table(
         name="feedback_use",
@@ -252,14 +252,14 @@ def feedback_use(rows: Iterable[dict[str, Any]]) -> Table:
     )
 
 
-def _audit_row(run: Run) -> dict[str, Any]:
+def _audit_row(run: Run) -> dict[str, object]:
     record, submits, selected = run.record, run.submits, run.record.outcome.best_submit_index
     dimensions = record.experiment_dimensions
     not_ok = sum(submit.status != "ok" for submit in submits)
     compared = (*run.scored[:1], run.selected)
     nodes = [each.source.features.nodes for each in compared if each and each.source]
 
-    def recorded(value: object) -> Any:
+    def recorded(value: object) -> object:
         return None if run.is_published else value
 
     return {

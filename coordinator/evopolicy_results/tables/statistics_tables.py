@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Sequence
-from typing import Any
 
 from msgspec.structs import replace
 
@@ -189,7 +188,7 @@ def starts_table(groups: Sequence[StartGroup]) -> Table:
     by_key["told_apart"] = replace(by_key["told_apart"], note="")
     kept = [by_key[key] for key in ("first", "second", "gap", "interval", "over", "p_holm", "told_apart")]
     kept += [by_key["runs"], by_key["cases"]]
-    rows: list[dict[str, Any]] = []
+    rows: list[dict[str, object]] = []
     for group in groups:
         of = {
             "env": title_of(group.env),

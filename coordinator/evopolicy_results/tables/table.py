@@ -27,7 +27,7 @@ DASH = "–"
 """Shown for a missing value; CSV leaves the field empty."""
 
 
-def at(record: object, path: str) -> Any:
+def at(record: object, path: str) -> object:
     """The attribute of a record at a path such as `gap.value`; None if an attribute on the way is None."""
     for name in path.split("."):
         record = None if record is None else getattr(record, name)
@@ -52,7 +52,7 @@ class Column(msgspec.Struct, frozen=True):
     spread: Callable[[Any], Estimate | Bounded | None] | None = None
     """The value with its interval, which gives the number of decimals."""
 
-    def value(self, record: Any) -> Any:
+    def value(self, record: object) -> object:
         """The value in a record."""
         return self.of(record) if callable(self.of) else at(record, self.of or self.key)
 

@@ -12,7 +12,6 @@ Rules that this module owns:
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from typing import Any
 
 import msgspec
 
@@ -29,7 +28,7 @@ from evopolicy_common.records.run_record import RunRecord
 from evopolicy_common.records.summary import Summary
 from evopolicy_results.verify.source import RunUnderTest
 
-Compared = Iterable[tuple[str, Any, Any]]
+Compared = Iterable[tuple[str, object, object]]
 """Names of numbers, each with its value and what it has to be."""
 
 MISSING = type("Missing", (), {"__repr__": lambda self: "nothing"})()
@@ -93,12 +92,12 @@ def _stored_outcome(record: RunRecord, result: RunResult) -> Compared:
     yield from unlike_documents(as_json(outcome), as_json(wanted), "outcome")
 
 
-def as_json(value: object) -> Any:
+def as_json(value: object) -> object:
     """The JSON document of a record."""
     return msgspec.json.decode(msgspec.json.encode(value))
 
 
-def unlike_documents(told: object, wanted: object, path: str = "") -> Iterator[tuple[str, Any, Any]]:
+def unlike_documents(told: object, wanted: object, path: str = "") -> Iterator[tuple[str, object, object]]:
     """The fields in which two JSON documents differ, by their paths, with both values (`MISSING` for none)."""
     if isinstance(told, dict) and isinstance(wanted, dict):
         for name in dict.fromkeys((*told, *wanted)):

@@ -13,7 +13,6 @@ Rules that this module owns:
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from typing import Any
 
 import msgspec
 
@@ -290,7 +289,7 @@ def _differences(
         yield f"{played.lengths[index]} steps are recorded, {again.length} were played"
     if summary is None:
         return
-    pairs: list[tuple[str, Any, Any]] = []
+    pairs: list[tuple[str, object, object]] = []
     parts, solved = summary.reward_components_per_episode, summary.successes
     if parts is not None and index < len(parts):
         pairs.append(("reward components", parts[index], again.reward_components))

@@ -94,6 +94,6 @@ def because(code: str, **about: object) -> Reason:
 class NotDoneError(Exception):
     """A rule does not carry out its request: the request is refused with the reason."""
 
-    def __init__(self, code: str | Reason, **about: Any) -> None:
+    def __init__(self, code: str | Reason, **about: object) -> None:
         super().__init__(code)
         self.reason = because(code, **about) if isinstance(code, str) else code

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Sequence
 from functools import cache
 from importlib.resources import files
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TypeVar
 from urllib.parse import urlencode
 
 import msgspec
@@ -70,13 +70,13 @@ def static_files() -> dict[str, tuple[bytes, str]]:
     return {path.name: (path.read_bytes(), types[Path(path.name).suffix]) for path in paths}
 
 
-def part(name: str, /, **values: Any) -> str:
+def part(name: str, /, **values: object) -> str:
     """The HTML of one part, by the macro that makes it: here, or among those of a run's page."""
     macro = getattr(_environment().get_template("parts.html.j2").module, name, None)
     return html.part(name, **values) if macro is None else str(macro(**values))
 
 
-def page(template: str, *, view: View | None = None, live: str = "", **values: Any) -> str:
+def page(template: str, *, view: View | None = None, live: str = "", **values: object) -> str:
     """A whole page; `live` are the ids of the elements that are kept up to date."""
     return html.page(template, view=view, own=_environment(), live=live, frame="web.html.j2", **values)
 

@@ -173,7 +173,7 @@ class Detail:
         lines = self.files.read_file(f"{folder}/trajectory.jsonl", _MAX_TRAJECTORY).splitlines()
         rows = list(itertools.islice(objects(lines), MAX_STEPS))
         inline = [row.get("obs") for row in rows]
-        observed: Any = inline if any(each is not None for each in inline) else self._arrays(folder)
+        observed: object = inline if any(each is not None for each in inline) else self._arrays(folder)
         observations, note = _series(observed, len(rows), "obs")
         actions, _ = _series([row.get("action") for row in rows], len(rows), "action")
         if all(type(row.get("action")) is int for row in rows):  # a discrete action holds until the next one

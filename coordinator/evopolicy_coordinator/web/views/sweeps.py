@@ -6,7 +6,6 @@ import shutil
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 from evopolicy_common.cli.conventions import bytes_text
 from evopolicy_common.terminal import counted, duration, number, short
@@ -151,7 +150,7 @@ def _matrix(name: str, sweep: Sweep, runs: Runs, agents: Mapping[str, Look], mos
     return matrix, most - len(shown)
 
 
-def _chip(run: RunFacts, may_show: bool) -> dict[str, Any]:
+def _chip(run: RunFacts, may_show: bool) -> dict[str, object]:
     symbol, words = STATES.get(run.state, ("?", run.state))
     facts = [f"repeat {run.repeat}", words]
     if run.budget:
