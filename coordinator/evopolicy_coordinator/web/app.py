@@ -201,13 +201,8 @@ class Site:
             replays = [(name, file_link(run, f"replays/{name}/video.mp4")) for name in names]
         title = f"{run.entry} on {run.env}"
         lead = [f"Run {run.exp_id}", f"repeat {run.repeat}", *filter(None, (run.run, str(run.path or "")))]
-        shown = {
-            "lead": lead,
-            "replays": replays,
-            "back": "/",
-            **dict.fromkeys(("beside", "unplaced", "checkpoints")),
-        }
-        return await self.live_page(request, f"run/{run.key}", "run", title, **shown)
+        name = f"run/{run.key}"
+        return await self.live_page(request, name, "run", title, lead=lead, replays=replays, back="/")
 
     async def submit_page(self, request: Request) -> Response:
         await self.refresh()

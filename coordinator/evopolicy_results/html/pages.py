@@ -230,7 +230,6 @@ def trace_page(
         beside=beside,
         unplaced=trace.unplaced,
         checkpoints=checkpoints,
-        replays=[],
     )
 
 

@@ -126,8 +126,8 @@ def _outcome(run: RunUnderTest, spent: int) -> Compared:
         return
     yield "number of heldout_returns", len(heldout), dimensions.n_heldout
     if heldout:
-        for name in ("final_score", "heldout_mean_return"):
-            yield name, getattr(outcome, name), mean(heldout)
+        yield "final_score", outcome.final_score, mean(heldout)
+        yield "heldout_mean_return", outcome.heldout_mean_return, mean(heldout)
         yield "heldout_std_return", outcome.heldout_std_return, std(heldout)
     scores = outcome.val_scores or {}
     quarantined = set(map(str, outcome.quarantined_submits))
@@ -151,9 +151,10 @@ def _summary(run: RunUnderTest, submit: SubmitFiles, spent: int) -> Compared:
     if summary.env_instances is not None:
         yield "n_episodes", summary.n_episodes, len(summary.env_instances)
     if summary.status == "ok":
-        for name in ("env_instances", "first_global_episode"):
-            if getattr(summary, name) is None:
-                yield name, None, "a value"
+        if summary.env_instances is None:
+            yield "env_instances", None, "a value"
+        if summary.first_global_episode is None:
+            yield "first_global_episode", None, "a value"
         yield from _aggregates(summary)
 
 
@@ -170,8 +171,7 @@ def _aggregates(summary: Summary) -> Compared:
     failed = summary.errors or ()
     if summary.policy_failures is not None:
         yield "policy_failures", summary.policy_failures, len(failed)
-    for name in ("errors", "timeouts"):
-        places = getattr(summary, name) or ()
+    for name, places in (("errors", failed), ("timeouts", summary.timeouts or ())):
         yield name, places, tuple(place for place in places if 0 <= place < n and place in failed)
     parts = summary.reward_components_per_episode
     if parts is not None:

@@ -348,9 +348,8 @@ def _with_entry(facts: RunFacts, entry: SweepRun) -> RunFacts:
 
 def _with_status(facts: RunFacts, status: RunStatus) -> RunFacts:
     """With the facts that only the cluster has of an unfinished run."""
-    waits_for, running, queued = status.waits_for, status.running, status.queued
     facts = replace(facts, state=status.phase, budget=status.budget)
-    return replace(facts, waits_for=waits_for, running=running, queued=queued)
+    return replace(facts, waits_for=status.waits_for, running=status.running, queued=status.queued)
 
 
 def _may_be_alive(status: RunStatus) -> bool:
