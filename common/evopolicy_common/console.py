@@ -6,7 +6,7 @@ This is a module of its own because rich is large and most commands do not need 
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import rich.console
 from rich.console import ConsoleOptions, JustifyMethod, RenderableType, RenderResult
@@ -21,9 +21,9 @@ from evopolicy_common.terminal import harmless
 if TYPE_CHECKING:
     from rich.progress import Progress
 
+T = TypeVar("T")
 WIDTH = 200
 """Columns without a terminal: a truncated table is worse than a long line."""
-
 
 _LEAST_WIDTH = 12
 """Least width of a column whose cells may fold, unless all words are shorter: words up to this length never break."""
@@ -113,8 +113,8 @@ def table(*headings: str, right: Collection[str] = (), whole: Collection[str] = 
 
 
 def listing(
-    records: Iterable[object],
-    columns: Mapping[str, Callable[[Any], str]],
+    records: Iterable[T],
+    columns: Mapping[str, Callable[[T], str]],
     *,
     right: Collection[str] = (),
     whole: Collection[str] = (),

@@ -174,10 +174,7 @@ class Site:
         """A page whose parts are kept up to date; status 304 for a browser that has it."""
         words = _words(request)
         view = await asyncio.to_thread(self.view_of(name, words))
-        live = " ".join(view.elements())
-        answer = self._page(
-            request, template, here=name, title=title, view=view, live=live, words=words, **more
-        )
+        answer = self._page(request, template, here=name, title=title, view=view, words=words, **more)
         etag = f'"{hashlib.sha256(answer.body).hexdigest()}"'
         if request.headers.get("if-none-match") == etag:
             return Response(status_code=304, headers={"etag": etag})

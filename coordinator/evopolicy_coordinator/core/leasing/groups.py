@@ -46,7 +46,8 @@ def _cut(group: JobGroup, heads: list[OutcomeHead], attempts: int, now: float) -
         group.digests[head.index] = OutcomeDigest(
             head.episode_return, head.length, head.failure, head.trajectory
         )
-    per_job = group.template.per_job
+    # With policy scope `submit`, the episodes that share one Policy are one job.
+    per_job = group.template.modulo if group.template.scope == "submit" else 1
     for first in range(0, group.n, per_job):
         if first in group.digests:
             continue

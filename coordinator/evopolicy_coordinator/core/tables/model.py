@@ -147,11 +147,6 @@ class Template:
     indexes: tuple[int, ...] = ()
     """For each index, the index in the list that the case was taken from; empty where they are equal."""
 
-    @property
-    def per_job(self) -> int:
-        """Episodes in a job: 1, or with policy scope `submit` the number of episodes that share one Policy."""
-        return self.modulo if self.scope == "submit" else 1
-
 
 @dataclass(slots=True, eq=False)
 class EnvironmentFaults:

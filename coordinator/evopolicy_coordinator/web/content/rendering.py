@@ -76,8 +76,9 @@ def part(name: str, /, **values: object) -> str:
     return html.part(name, **values) if macro is None else str(macro(**values))
 
 
-def page(template: str, *, view: View | None = None, live: str = "", **values: object) -> str:
-    """A whole page; `live` are the ids of the elements that are kept up to date."""
+def page(template: str, *, view: View | None = None, **values: object) -> str:
+    """A whole page; the elements of its `view` are kept up to date."""
+    live = "" if view is None else " ".join(view.elements())
     return html.page(template, view=view, own=_environment(), live=live, frame="web.html.j2", **values)
 
 
