@@ -35,7 +35,7 @@ FORMS = (("CSV", "csv"), ("Markdown", "md"), ("LaTeX", "tex"))
 """File forms of a table, with their suffixes."""
 
 
-class _Section(NamedTuple):
+class _Section(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     ident: str
     nav: str
     ask: str
