@@ -124,6 +124,7 @@ class Gateway:
     async def _watch(self, pipeline: SubmitPipeline, http: asyncio.Task[None]) -> CloseRun | None:
         """Reports changes until `tell`; returns its argument."""
         ends: list[asyncio.Future[Any]] = [self._orders, pipeline.fatal, http]
+        machine = pipeline.machine
         self._changed.set()
         while True:
             changed = asyncio.ensure_future(self._changed.wait())
@@ -138,7 +139,10 @@ class Gateway:
                 self._on_change(pipeline)
             if self._orders.done():
                 return self._orders.result()
-            await asyncio.wait(ends, timeout=_REPORT_S, return_when=asyncio.FIRST_COMPLETED)
+            # At once: after its last submit an agent may end at any moment, and the reason counts that comes first.
+            over = asyncio.ensure_future(pipeline.until(lambda: machine.spent or machine.cancelled))
+            await asyncio.wait([over, *ends], timeout=_REPORT_S, return_when=asyncio.FIRST_COMPLETED)
+            over.cancel()
 
     async def _close(self, pipeline: SubmitPipeline, close: CloseRun) -> bool:
         await asyncio.to_thread(save, self._folder.closing, close)
