@@ -18,7 +18,7 @@ def test_an_agent_goes_on_when_its_session_cannot_be_kept(tmp_path: Path) -> Non
     assert session.load(path) == session.SessionState()
 
 
-def test_a_run_goes_on_when_the_rest_of_its_limits_cannot_be_kept(tmp_path: Path) -> None:
+def test_a_run_goes_on_when_its_left_limits_cannot_be_kept(tmp_path: Path) -> None:
     folder = RunFolder(tmp_path)
     harness = SimpleNamespace(model=None)
     plan = SimpleNamespace(harness=lambda: harness, wall_limit_s=60.0)
