@@ -36,7 +36,7 @@ ENVIRONMENTS = {
 """Episodes of a submit by id."""
 TURNS = {"slots": 40, "submits": 20}
 SLOT_EPISODES = 4
-"""Of a submit's episodes, every so many is a slot's in a turn."""
+"""A slot plays one in so many of a submit's episodes in a turn."""
 SLOT = """
 import asyncio, os, sys, time
 from pathlib import Path
@@ -95,8 +95,7 @@ def installed(revision: str, console: Console) -> Path:
 @contextlib.contextmanager
 def player(clone: Path, env: str, n: int, *, slots: bool) -> Iterator[Callable[[], float]]:
     """A new slot or cluster of a revision: a call plays a turn of `n` episodes and returns its seconds."""
-    local = clone / ".venv" / "bin" / "python"
-    python = str(local) if clone != ROOT else sys.executable
+    python = sys.executable if clone == ROOT else str(clone / ".venv" / "bin" / "python")
     path = os.pathsep.join(str(clone / "tests" / name) for name in ("bench", "support"))
     with tempfile.TemporaryDirectory(prefix="evopolicy-against-") as name:
         folder = Path(name)
@@ -115,29 +114,29 @@ def player(clone: Path, env: str, n: int, *, slots: bool) -> Iterator[Callable[[
         for fifo in (orders, answers):
             os.mkfifo(fifo)
         # Both ways, so that neither side waits for the other to open.
-        told, heard = (os.fdopen(os.open(fifo, os.O_RDWR), "r+b", 0) for fifo in (orders, answers))
-        with told, heard, (folder / "errors").open("w") as errors:
+        to_player, from_player = (os.fdopen(os.open(fifo, os.O_RDWR), "r+b", 0) for fifo in (orders, answers))
+        with to_player, from_player, (folder / "errors").open("w") as errors:
             process = subprocess.Popen(
                 command,
                 cwd=clone,
                 env=variables,
-                stdin=told,
-                stdout=heard if slots else errors,
+                stdin=to_player,
+                stdout=from_player if slots else errors,
                 stderr=errors,
             )
 
             def play_turn() -> float:
-                told.write(b"\n")
-                while not select.select([heard], [], [], 1.0)[0]:
+                to_player.write(b"\n")
+                while not select.select([from_player], [], [], 1.0)[0]:
                     if process.poll() is not None:
                         why = (folder / "errors").read_text().strip()[-1000:]
                         raise SystemExit(f"error: {env} in {clone}: {why}")
-                return float(heard.readline())
+                return float(from_player.readline())
 
             try:
                 yield play_turn
             finally:
-                told.write(b"end\n")
+                to_player.write(b"end\n")
                 process.wait()
 
 
@@ -167,9 +166,8 @@ def main() -> None:
     console = frame.console()
     clones = {"then": installed(options.revision, console), "now": ROOT}
     found: dict[str, list[dict[str, list[float]]]] = {}
-    title = (
-        f"{options.revision} and now, {options.rounds} pairs of {'slots' if options.slots else 'clusters'}"
-    )
+    kind = "slots" if options.slots else "clusters"
+    title = f"{options.revision} and now, {options.rounds} pairs of {kind}"
     columns = ("shortest now, s", "now over then", "standard error")
     table = frame.table("environment", *columns, title=f"{title} (load {os.getloadavg()[0]:.1f})")
     for env in options.envs:
