@@ -442,8 +442,8 @@ class _Exchange:
         self._written = True
         line, tier = replace(self._line, broken=broken, wait_s=wait_s), self._facts.tier
         if self._reader is not None and not self._route.free:
-            usage, estimated, answered, told = self._reader.metered(self._facts.input)
-            line, tier = replace(line, usage=usage, estimated=estimated, answered=answered), told or tier
+            usage, estimated, answered, named = self._reader.metered(self._facts.input)
+            line, tier = replace(line, usage=usage, estimated=estimated, answered=answered), named or tier
         elif not self._line.status and not isinstance(error, NOT_SENT) and not self._route.free:
             late = isinstance(error, httpcore.ReadTimeout)
             usage = self.reserve.usage if late else Usage(input_noncached=self._facts.input)

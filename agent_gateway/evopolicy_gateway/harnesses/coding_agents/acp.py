@@ -155,10 +155,11 @@ class AcpAgent(CliAgent):
             await link.request("session_set_mode", {"sessionId": link.session, "modeId": mode})
         config = self._config
         words = (*self._program, *config.extra_args, *config.environment.values())
-        for name, value in (("model", config.model), ("effort", config.effort)):
+        chosen = (("model", "model", config.model), ("effort", "thought_level", config.effort))
+        for name, category, value in chosen:
             if value is None:
                 continue
-            choice = offered_choice(answer, "model" if name == "model" else "thought_level")
+            choice = offered_choice(answer, category)
             started_with_it = any(value in word for word in words)
             if choice is not None and (value in choice.values or not started_with_it):
                 await link.choose(choice, value)
