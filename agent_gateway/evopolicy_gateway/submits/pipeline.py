@@ -79,7 +79,7 @@ class SubmitPipeline:
             died = Died(key=key, episodes=tuple(episodes))
             self.machine.noted(died, journal.append(died))
         journal.at_work.clear()
-        self._go_on()
+        self._start_work()
 
     async def submit(self, body: bytes, client_key: str | None) -> Ticket:
         """Takes a request, or returns the ticket of the one that it repeats.
@@ -94,7 +94,7 @@ class SubmitPipeline:
         except RequestError as error:
             await self.note_rejected(error)
             raise
-        self._go_on()
+        self._start_work()
         return ticket
 
     async def note_rejected(self, error: RequestError) -> None:
@@ -146,7 +146,7 @@ class SubmitPipeline:
             self._task.cancel()
             await asyncio.gather(self._task, return_exceptions=True)
 
-    def _go_on(self) -> None:
+    def _start_work(self) -> None:
         if self.machine.in_flight is not None:
             self._task = asyncio.create_task(self._carry_out())
             self._changed()

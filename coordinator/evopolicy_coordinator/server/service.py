@@ -441,12 +441,12 @@ class Service:
 
     def _carry_out(self, effect: Effect) -> None:
         try:
-            self._carried_out(effect)
+            self._perform(effect)
         except Exception:
             # Only one client is affected and it retries; the replies queued behind this one must still go out.
             log.exception("cannot carry out", effect=type(effect).__name__)
 
-    def _carried_out(self, effect: Effect) -> None:
+    def _perform(self, effect: Effect) -> None:
         if isinstance(effect, Reply | Refuse | ReadEffect):
             pending = self._pending.pop(effect.request, None)
             if pending is None:

@@ -79,7 +79,7 @@ class EnvProcess:
         self._last_report = (0.0, 0)
         self._limits = limits
         self._guard = calls.Guard(limits)
-        self._monitor = Monitor(commands, self._hear, self._tell)
+        self._monitor = Monitor(commands, self._take_commands, self._check_and_report)
 
     def run(self, start: messages.Start, early: list[messages.Command]) -> None:
         if start.core is not None:
@@ -101,7 +101,7 @@ class EnvProcess:
         faulthandler.enable(all_threads=False)  # so that a crash names the environment's lines
         calls.current.process = os.getpid()
         player = JobPlayer(zygote, plan, self._monitor, scratch)
-        self._hear(early)
+        self._take_commands(early)
         self._monitor.start()
         player.policies.prepare()
         self._channel.send(messages.Ready())
@@ -153,7 +153,7 @@ class EnvProcess:
             kind = "environment"
         return messages.Fault(kind=kind, message=text or fault_of(error))
 
-    def _hear(self, commands: list[messages.Command] | None = None) -> None:
+    def _take_commands(self, commands: list[messages.Command] | None = None) -> None:
         """Takes these commands, or those that arrive."""
         for command in self._channel.receive() if commands is None else commands:
             if isinstance(command, messages.Describe):
@@ -170,7 +170,7 @@ class EnvProcess:
                 # Now: a simulator may take long over its step, and is ended then.
                 progress.give_up(self._channel.send)
 
-    def _tell(self) -> None:
+    def _check_and_report(self) -> None:
         now = time.monotonic()
         progress = self._progress
         if passed := self._guard.check(now):

@@ -323,10 +323,10 @@ class _Episode:
             policy.reset(self.spec.episode_index)
             return policy
         except PolicyFailedError as error:
-            self._note(error.failure)
+            self._keep_failure(error.failure)
             return None
 
-    def _note(self, failure: PolicyFailure, step: int | None = None) -> None:
+    def _keep_failure(self, failure: PolicyFailure, step: int | None = None) -> None:
         if self.progress.cancelled:
             raise CancelledJobError
         self.begun.fail(msgspec.structs.replace(failure, step_index=step))
@@ -354,7 +354,7 @@ class _Episode:
             try:
                 returned, action, mark = source(t, obs)
             except PolicyFailedError as error:
-                self._note(error.failure, t)
+                self._keep_failure(error.failure, t)
                 source = self._source(None)
                 returned, action, mark = source(t, obs)
             if not self.acted and t < len(taken):

@@ -9,7 +9,7 @@ Rules:
 | state | event | next |
 |---|---|---|
 | closed | `start` | ready; closed, with SandboxError or WorkerError |
-| ready | `play` | playing; in a new process if this one may remember a hidden episode, or cannot draw |
+| ready | `play_job` | playing; in a new process if this one may remember a hidden episode, or cannot draw |
 | | `describe` | ready; its process has ended or is killed, with BrokenEnvironmentError or SlotDiedError |
 | playing | `Progress`, `Acting`, `Finished`, `Begun`, `Filmed` | playing |
 | | `Played` | ready, with the outcomes; without any after `cancel` |
@@ -17,7 +17,7 @@ Rules:
 | | the environment ends, breaks down or hangs on a policy's actions | playing, in a new process |
 | | the process ends otherwise | ended, with SlotDiedError or BrokenEnvironmentError |
 | | `cancel`, and no answer for `CANCEL_TIMEOUT_S` | ended |
-| | the task of `play` is cancelled | ended |
+| | the task of `play_job` is cancelled | ended |
 | ended | `start` | as from closed |
 | any | `close` | closed; its scratch folder is removed |
 """
@@ -280,7 +280,7 @@ class Slot:
 
     async def describe(self, env_ids: Sequence[str]) -> tuple[EnvironmentDescription, ...]:
         """Descriptions of these environments, which are made in the slot's process and stay there for jobs. Raises as
-        `play`."""
+        `play_job`."""
         if self._process is None:
             raise WorkerError("the slot is not started")
         limits = self._start.limits
@@ -308,7 +308,7 @@ class Slot:
         return 0 if self._process is None else _memory(self._process.pid)
 
     async def cancel(self) -> None:
-        """Stops the running job, if any; its `play` returns, and the slot can be used again."""
+        """Stops the running job, if any; its `play_job` returns, and the slot can be used again."""
         if self._idle.is_set():
             return
         process = self._process

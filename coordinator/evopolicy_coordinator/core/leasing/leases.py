@@ -7,7 +7,7 @@ Rules that this module owns:
   `workers.results`: it is the same on every worker.)
 - Heartbeats that name a lease keep it alive. A lease that never arrived at its worker is given up.
 - A lease that this incarnation did not grant is adopted from its holder's heartbeat if its job waits.
-- Giving up a job's lease puts the job back as `retry` decides; only jobs that ran are blamed.
+- Giving up a job's lease puts the job back as `jobs.decide` says; only jobs that ran are blamed.
 - A worker that stops a policy's hidden job returns the policy's actions so far, and the next attempt plays them first.
 """
 
@@ -215,7 +215,7 @@ def give_back(
     ran: bool,
     error: str = "",
 ) -> None:
-    """Put a job whose lease has ended back into the queue, as `retry` decides."""
+    """Put a job whose lease has ended back into the queue, as `jobs.decide` says."""
     retry = decide(state.settings, failure, failures=job.failures + 1, ran=ran)
     job.since = step.now
     if retry.counted:

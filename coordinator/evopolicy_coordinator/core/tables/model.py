@@ -173,7 +173,7 @@ class JobState:
     generation: int = 0
     """Incremented whenever the job enters or leaves the queue; queue entries with an older generation are void."""
     place: Place = "new"
-    """`transitions.JOB` lists the allowed successors."""
+    """`JOB` lists the allowed successors."""
     lease: Lease | None = None
     failures: int = 0
     """Infrastructure failures so far, in this incarnation."""

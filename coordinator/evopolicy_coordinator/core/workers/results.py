@@ -13,9 +13,8 @@ Rules that this module owns:
 - An outcome that does not fit the job (wrong episodes, a number that is not finite, or beyond 1e100) or a page for its
   gateway is the worker's failure.
 - The time that an episode took counts for the fair share only up to the time for which its worker had the lease.
-- A failure that a policy can cause in its slot is an outcome. A failure that it cannot cause is retried without limit:
-  `failed`. An environment that keeps ending a job is given up
-  (`retry`).
+- A failure that a policy can cause in its slot is an outcome. A failure that it cannot cause is retried without limit.
+  An environment that keeps ending a job is given up (`jobs.in_vain`).
 """
 
 from __future__ import annotations

@@ -155,7 +155,7 @@ def dispatch(state: State, step: Step) -> None:
     for lane in fed:
         precedence.watch(state, lane, step)
     for name, stops in step.stops.items():
-        _tell(state, name, tuple(stops), step)
+        _tell_stops(state, name, tuple(stops), step)
 
 
 def _place_suspects(state: State, step: Step) -> None:
@@ -170,7 +170,7 @@ def _place_suspects(state: State, step: Step) -> None:
                         _to_the_back(state, worker, step)
 
 
-def _tell(state: State, name: str, stops: tuple[str, ...], step: Step) -> None:
+def _tell_stops(state: State, name: str, stops: tuple[str, ...], step: Step) -> None:
     """Notify a worker of leases to stop if a heartbeat or poll of it waits; otherwise its next heartbeat does so."""
     worker = state.workers.get(name)
     if worker is None:

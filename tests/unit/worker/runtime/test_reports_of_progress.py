@@ -21,7 +21,7 @@ def test_a_monitor_that_still_sees_a_finished_job_reports_nothing(given_up: bool
     progress.steps = 7
     if given_up:
         progress.give_up(None)
-    process._tell()
+    process._check_and_report()
     for fd in (replies_in, commands_in, commands):
         os.close(fd)
     with open(replies, "rb") as sent:

@@ -44,8 +44,8 @@ class Opaque(NamedTuple):
     """How a family encodes the values of one space of a kind that the protocol has no form for.
 
     The family names a space of a known kind, and how a value becomes one of that space and back
-    (`GymnasiumFamily.opaque`). Policies, feedback and recordings have the encoded values only. The space may be a part
-    of a Dict or Tuple.
+    (`GymnasiumFamily.encoding`). Policies, feedback and recordings have the encoded values only. The space may be a
+    part of a Dict or Tuple.
     """
 
     space: gymnasium.Space[Any]
