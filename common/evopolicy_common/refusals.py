@@ -58,6 +58,9 @@ class Refusal(StrEnum):
         return cls.OTHER
 
 
+WRONG_REQUEST = frozenset({Refusal.BUDGET_INVALID, Refusal.INVALID_ENV_INSTANCE})
+"""For a run's gateway: the agent gets the refusal of its submit. A code that has no rule ends the gateway's process."""
+
 RUN_OVER = frozenset({Refusal.RUN_CANCELLED, Refusal.RUN_CLOSED, Refusal.RUN_FINISHED})
 """For a run's gateway: no further request of this run is served."""
 

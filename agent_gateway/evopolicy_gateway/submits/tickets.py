@@ -34,7 +34,7 @@ from evopolicy_common.records.blobs import digest_of
 from evopolicy_common.records.open_run import AnyLine, Requested
 from evopolicy_common.records.run_record import RejectedStatus, RejectedSubmit
 from evopolicy_common.records.summary import utc_text
-from evopolicy_common.refusals import RUN_OVER, Refusal
+from evopolicy_common.refusals import RUN_OVER, WRONG_REQUEST, Refusal
 from evopolicy_gateway.run_folder.layout import submit_id
 from evopolicy_gateway.submits.snapshots import Snapshot
 from evopolicy_gateway.submits.submit_request import Bounds, parse
@@ -44,7 +44,6 @@ RUN_CLOSED = "run_closed"
 """The published protocol's status for a submit after the last possible one."""
 MAX_DEATHS = 2
 """Number of gateway crashes over one submit, or over one episode's files, after which it is abandoned."""
-_REQUEST_STATUSES = (Refusal.BUDGET_INVALID, Refusal.INVALID_ENV_INSTANCE)
 
 
 class ConflictError(RequestError):
@@ -272,7 +271,7 @@ class TicketMachine:
         request, over = self._open.request, error.status in RUN_OVER
         if over:
             self.close(cancelled=error.status == Refusal.RUN_CANCELLED)
-        if self._open.accepted is None and (over or error.status in _REQUEST_STATUSES):
+        if self._open.accepted is None and (over or error.status in WRONG_REQUEST):
             return Note(open_run.Refused(key=request.submit.key, status=error.status, message=error.message))
         if not over:
             return self.failed(error)
