@@ -1,16 +1,19 @@
 """The artifacts of one run as texts that do not change from run to run: times, names and machines are taken out.
 
-`python tests/conformance/protocol/golden_artifacts.py RUN` writes the golden files anew from a run of `AGENT`.
+`PYTHONPATH=tests/support python tests/conformance/protocol/golden_artifacts.py` writes the golden files anew.
 """
 
 from __future__ import annotations
 
 import json
 import re
-import sys
+import tempfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+
+from commands import agent
+from played import play
 
 GOLDEN = Path(__file__).parent / "golden"
 BUDGET = 5
@@ -130,11 +133,13 @@ def _plain(name: str, value: Any) -> Any:
     return value
 
 
-def main(run: Path) -> None:
-    """Writes the golden files."""
-    for name, text in artifacts(run).items():
-        (GOLDEN / name).write_text(text)
+def play_golden(root: Path) -> Path:
+    """The run directory of `AGENT`."""
+    agent(root, AGENT)
+    return play(root, root / "agent.py", BUDGET)
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]))
+    with tempfile.TemporaryDirectory() as root:
+        for name, text in artifacts(play_golden(Path(root))).items():
+            (GOLDEN / name).write_text(text)

@@ -7,9 +7,8 @@ import json
 from pathlib import Path
 
 import pytest
-from commands import agent
-from golden_artifacts import AGENT, BUDGET, GOLDEN, artifacts
-from played import DATA, play
+from golden_artifacts import GOLDEN, artifacts, play_golden
+from played import DATA
 from published_checker import check_run
 
 pytestmark = pytest.mark.timeout(600)
@@ -18,9 +17,7 @@ NAMES = sorted(path.name for path in GOLDEN.iterdir())
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    root = tmp_path_factory.mktemp("golden")
-    agent(root, AGENT)
-    return play(root, root / "agent.py", BUDGET)
+    return play_golden(tmp_path_factory.mktemp("golden"))
 
 
 @pytest.mark.parametrize("name", NAMES)
