@@ -57,7 +57,7 @@ class Cluster:
     may call it at once. A cluster opens once: a second `open` raises ConfigError, and so does a call before it is open.
     """
 
-    def __init__(self, where: operator.Cluster) -> None:
+    def __init__(self, where: operator.ChosenCluster) -> None:
         """Private: use `Cluster.local` or `Cluster.connect`."""
         self._where = where
         self._reached: operator.Reached | None = None
@@ -96,7 +96,7 @@ class Cluster:
             data=given["data"],
             policy_package=list(given["policy_packages"]),
         )
-        return cls(operator.Cluster(local=chosen))
+        return cls(operator.ChosenCluster(local=chosen))
 
     @classmethod
     def connect(cls, *endpoints: str, credentials: str | os.PathLike[str] | None = None) -> Cluster:
@@ -106,7 +106,7 @@ class Cluster:
         cluster of this machine.
         """
         connect = tuple(check_argument("endpoint", endpoint) for endpoint in endpoints)
-        return cls(operator.Cluster(connect=connect, file=check_argument("credentials", credentials)))
+        return cls(operator.ChosenCluster(connect=connect, file=check_argument("credentials", credentials)))
 
     def open(self) -> Self:
         """Starts or connects to the cluster, for notebooks. `close` ends it, and so does the end of the process."""

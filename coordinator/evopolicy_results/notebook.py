@@ -21,7 +21,7 @@ from evopolicy_results.behaviour.trace import trace
 from evopolicy_results.figures import figures_of
 from evopolicy_results.reading.comparability import MixedRunsError, mixtures
 from evopolicy_results.reading.reader import load_runs
-from evopolicy_results.reading.records import Run, Submit, rows
+from evopolicy_results.reading.records import PastRun, PastSubmit, rows
 from evopolicy_results.report import write_report
 from evopolicy_results.scoring.scores import heldout_returns, leaderboard, score_table
 from evopolicy_results.studies.study import Study, study, study_of
@@ -29,9 +29,9 @@ from evopolicy_results.tables.report_tables import tables_of
 
 __all__ = [
     "MixedRunsError",
-    "Run",
+    "PastRun",
+    "PastSubmit",
     "Study",
-    "Submit",
     "classify",
     "edit_rates",
     "figures_of",

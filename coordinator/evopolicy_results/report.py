@@ -36,7 +36,7 @@ from evopolicy_results.html.pages import (
 )
 from evopolicy_results.reading.environments import grouped, names_in_runs, ordered_environments
 from evopolicy_results.reading.parallel import ALONE, Processes
-from evopolicy_results.reading.records import Run, path_text
+from evopolicy_results.reading.records import PastRun, path_text
 from evopolicy_results.studies.palette import Look, looks
 from evopolicy_results.studies.study import Study
 from evopolicy_results.tables.latex import to_latex
@@ -116,7 +116,7 @@ def write_report(
     return write_file(out / "index.html", text)
 
 
-def slug(run: Run) -> str:
+def slug(run: PastRun) -> str:
     """A file name for the run's page: readable, and unique by a hash of the run's name."""
     text = _NO_NAME.sub("-", f"{run.env}-{run.entry}-{run.record.exp_id}").strip("-.")[:90]
     return f"{text}-{hashlib.sha256(run.name.encode()).hexdigest()[:8]}"
@@ -152,7 +152,7 @@ def _lost(item: tuple[object, partial[object]], why: str) -> object:
 
 
 def _page(
-    run: Run, out: Path, look: Look | None, beside: Sequence[tuple[str, Look | None, str]]
+    run: PastRun, out: Path, look: Look | None, beside: Sequence[tuple[str, Look | None, str]]
 ) -> list[dict[str, object]]:
     """Writes the page of a run, with its images and videos beside it, and returns its submits."""
     name, folder = slug(run), out / "traces"
@@ -175,14 +175,16 @@ def _page(
         return _write_failed(run, out, f"{type(error).__name__}: {error}")
 
 
-def _write_failed(run: Run, out: Path, why: str) -> list[dict[str, object]]:
+def _write_failed(run: PastRun, out: Path, why: str) -> list[dict[str, object]]:
     write_file(out / "traces" / f"{slug(run)}.html", page("failed", title=run_title(run), reason=why))
     return []
 
 
-def _beside(run: Run, runs: Sequence[Run], look: Mapping[str, Look]) -> list[tuple[str, Look | None, str]]:
+def _beside(
+    run: PastRun, runs: Sequence[PastRun], look: Mapping[str, Look]
+) -> list[tuple[str, Look | None, str]]:
     """One run of each other agent, with the same repeat number if there is one."""
-    chosen: dict[str, Run] = {}
+    chosen: dict[str, PastRun] = {}
     for other in runs:
         if other.entry != run.entry:
             first = chosen.setdefault(other.entry, other)
@@ -202,7 +204,7 @@ def _copied(path: Path, folder: Path, stem: str) -> str | None:
 
 
 def _write_replays(study: Study, out: Path, look: Mapping[str, Look]) -> dict[str, str]:
-    def copied(run: Run, path: str | None, number: int) -> str | None:
+    def copied(run: PastRun, path: str | None, number: int) -> str | None:
         """None too for a file outside the run directory, and for any but an image or video."""
         source = (run.path / (path or "")).resolve()
         if not source.is_relative_to(run.path.resolve()) or source.suffix.lower() not in _MEDIA:

@@ -51,7 +51,7 @@ from evopolicy_gateway.run_folder.layout import RunFolder
 from evopolicy_worker import environments
 from evopolicy_worker.capabilities import Capabilities
 from evopolicy_worker.slot_protocol import slot_messages
-from evopolicy_worker.supervisor import Options, Supervisor
+from evopolicy_worker.supervisor import Supervisor, WorkerOptions
 
 POLICY = '''"""Actions that differ from step to step, and are the same in every run."""
 import numpy as np
@@ -141,7 +141,7 @@ async def answer(options: Any) -> None:
         tasks = []
         for number in range(options.workers):
             name = f"w-{options.process}-{number}"
-            own = Options(
+            own = WorkerOptions(
                 name=name,
                 slots=options.slots,
                 fingerprint=FINGERPRINT,

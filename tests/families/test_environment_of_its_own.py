@@ -20,7 +20,7 @@ from coordinator_harness import Coordinator
 from test_parity import differences, named
 
 from evopolicy_common.catalogue import installs, suites
-from evopolicy_common.catalogue.installs import Made
+from evopolicy_common.catalogue.installs import MadeEnvironment
 from evopolicy_common.records.run_record import decode_run_record
 from evopolicy_common.statistics.intervals import over_cases
 
@@ -86,7 +86,7 @@ def program(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
         yield from_a_wheel(tmp_path_factory.mktemp("wheel"))
 
 
-def set_up(program: Path, family: str) -> Made:
+def set_up(program: Path, family: str) -> MadeEnvironment:
     """The virtual environment that `setup` makes."""
     done = subprocess.run(
         [str(program), "setup", family],
@@ -103,14 +103,14 @@ def set_up(program: Path, family: str) -> Made:
 
 
 @pytest.fixture(scope="module")
-def made(program: Path) -> Made:
+def made(program: Path) -> MadeEnvironment:
     """The virtual environment of the family that excludes others."""
     return set_up(program, FAMILY)
 
 
 @pytest.mark.slow
 @pytest.mark.timeout(900)
-def test_its_packages_are_those_that_the_installation_here_excludes(made: Made) -> None:
+def test_its_packages_are_those_that_the_installation_here_excludes(made: MadeEnvironment) -> None:
     assert not installs.is_here(FAMILY)
     listed = subprocess.run(
         [made.python, "-m", "pip", "list", "--format", "json"], capture_output=True, text=True, check=True
@@ -126,7 +126,7 @@ def test_its_packages_are_those_that_the_installation_here_excludes(made: Made) 
 
 @pytest.mark.slow
 @pytest.mark.timeout(900)
-def test_check_env_finds_nothing_in_a_few_of_its_environments(made: Made) -> None:
+def test_check_env_finds_nothing_in_a_few_of_its_environments(made: MadeEnvironment) -> None:
     """Asked here, where CartPole is played."""
     ids = [ENV, "gymnasium/minecart-v0", "gymnasium/mo-hopper-v5", "gymnasium/CartPole-v1"]
     program = [sys.executable, "-P", "-m", "evopolicy_worker.cli", "check-env", *ids]
@@ -138,7 +138,7 @@ def test_check_env_finds_nothing_in_a_few_of_its_environments(made: Made) -> Non
 
 @pytest.mark.slow
 @pytest.mark.timeout(900)
-def test_every_text_is_whole_and_has_nothing_of_a_library(made: Made) -> None:
+def test_every_text_is_whole_and_has_nothing_of_a_library(made: MadeEnvironment) -> None:
     checks = ROOT / "tests" / "conformance" / "environments" / "text_checks.py"
     program = [made.python, str(checks), *suites()[FAMILY].environments]
     helpers = dict(os.environ, PYTHONPATH=str(ROOT / "tests" / "support"))
@@ -149,14 +149,14 @@ def test_every_text_is_whole_and_has_nothing_of_a_library(made: Made) -> None:
 
 @pytest.mark.slow
 @pytest.mark.timeout(900)
-def test_a_sample_is_played_as_its_library_plays_it(made: Made, tmp_path: Path) -> None:
+def test_a_sample_is_played_as_its_library_plays_it(made: MadeEnvironment, tmp_path: Path) -> None:
     found = differences(made.python, FAMILY, tmp_path)
     assert found == dict.fromkeys(named(FAMILY), "")
 
 
 @pytest.mark.slow
 @pytest.mark.timeout(900)
-def test_a_policy_beats_random_on_cases_drawn_by_the_familys_name(made: Made) -> None:
+def test_a_policy_beats_random_on_cases_drawn_by_the_familys_name(made: MadeEnvironment) -> None:
     program = [made.python, "-P", "-c", PLAYS, ENV, FAMILY, str(POLICY), str(N_CASES)]
     done = subprocess.run(program, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
@@ -168,7 +168,7 @@ def test_a_policy_beats_random_on_cases_drawn_by_the_familys_name(made: Made) ->
 
 @pytest.mark.slow
 @pytest.mark.timeout(900)
-def test_evolve_plays_a_whole_run_with_a_worker_from_it(tmp_path: Path, made: Made) -> None:
+def test_evolve_plays_a_whole_run_with_a_worker_from_it(tmp_path: Path, made: MadeEnvironment) -> None:
     small = ["--budget", "4", "--validation", "2", "--heldout", "2", "--video", "all"]
     with command(tmp_path, "local", "--env", ENV, "--agent", "evolve", "--exp-id", "t", *small) as running:
         code, _, err = running.finish()
@@ -223,7 +223,7 @@ def workers(coordinator: Coordinator, offered: Mapping[str, str]) -> Iterator[No
 @pytest.mark.slow
 @pytest.mark.timeout(900)
 def test_each_run_of_a_mixed_suite_names_its_workers_installation(
-    tmp_path: Path, program: Path, made: Made
+    tmp_path: Path, program: Path, made: MadeEnvironment
 ) -> None:
     third = set_up(program, "minigrid")
     offered = {

@@ -32,12 +32,12 @@ async def serve(state: Path, ready_file: Path, listen: tuple[str, ...]) -> None:
     for number in (signal.SIGTERM, signal.SIGINT):
         loop.add_signal_handler(number, stop.set)
 
-    def on_ready(ready: process.Ready) -> None:
+    def on_ready(ready: process.ReadyCluster) -> None:
         write_atomically(ready_file, msgspec.json.encode(ready), mode=0o600)
 
     # Of coordinators on one database.
     store, key = os.environ.get("FAULTS_STORE"), os.environ.get("FAULTS_SEAL_KEY")
-    options = process.Options(
+    options = process.CoordinatorOptions(
         state=state,
         listen=listen,
         insecure_tcp=True,

@@ -497,7 +497,7 @@ class Served(msgspec.Struct, frozen=True):
         return found
 
     async def close(self, reason: str = "agent_stopped") -> bool:
-        self.gateway.tell(child_messages.CloseRun(reason=reason))
+        self.gateway.tell(child_messages.CloseGateway(reason=reason))
         return await self.task
 
 

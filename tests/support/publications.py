@@ -21,7 +21,7 @@ from evopolicy_common.records.run_record import decode_run_record
 from evopolicy_coordinator.pki import identity
 from evopolicy_results.publish import card as cards
 from evopolicy_results.publish import contents, descriptions
-from evopolicy_results.publish.archive import Archive, Writer
+from evopolicy_results.publish.archive import Archive, ArchiveWriter
 from evopolicy_results.publish.run_rules import return_of
 
 ENV = "toy/line"
@@ -213,7 +213,7 @@ class Forger:
             return
         try:
             sources = [
-                cards.Source(
+                cards.CardSource(
                     name[:9],
                     decode_run_record(data),
                     msgspec.json.decode(self.files[f"{name[:9]}/{contents.RESULT}"], type=RunResult),
@@ -247,7 +247,7 @@ class Forger:
 
 def written(path: Path, files: dict[str, bytes]) -> Path:
     """These files as an archive."""
-    writer = Writer(path)
+    writer = ArchiveWriter(path)
     for name, data in files.items():
         writer.add(name, data)
     writer.close()

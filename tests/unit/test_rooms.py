@@ -249,3 +249,14 @@ def test_a_tests_name_has_at_most_twelve_words_and_ninety_characters() -> None:
         for name in re.findall(r"^\s*(?:async )?def (test_\w+)\(", path.read_text(), re.MULTILINE)
     )
     assert [name for name in names if len(name) > 90 or name.count("_") > 12] == []
+
+
+def test_a_class_of_the_product_has_a_name_of_its_own() -> None:
+    """But private ones, those of `evopolicy`, whose names are for users, and each policy program's `Policy`."""
+    places: dict[str, list[str]] = {}
+    inner = {name: path for name, path in modules().items() if not name.startswith("evopolicy.")}
+    for module, path in inner.items():
+        for node in ast.parse(path.read_text(encoding="utf-8")).body:
+            if isinstance(node, ast.ClassDef) and not node.name.startswith("_") and node.name != "Policy":
+                places.setdefault(node.name, []).append(module)
+    assert {name: found for name, found in places.items() if len(found) > 1} == {}

@@ -61,7 +61,7 @@ class InASlot(msgspec.Struct, frozen=True, kw_only=True):
     """As `EnvironmentDescription.notes`."""
 
 
-class Checked(msgspec.Struct, frozen=True):
+class CheckedEnvironment(msgspec.Struct, frozen=True):
     """One environment, played in two processes with different hash seeds."""
 
     here: CheckResult
@@ -85,7 +85,9 @@ class Checked(msgspec.Struct, frozen=True):
         return (*played, f"{here.step_bytes:,}", memory, self.verdict)
 
 
-def check(env_ids: Sequence[str], definitions: tuple[Entry, ...], steps: int = STEPS) -> Iterator[Checked]:
+def check(
+    env_ids: Sequence[str], definitions: tuple[Entry, ...], steps: int = STEPS
+) -> Iterator[CheckedEnvironment]:
     """Yields each environment when both processes and a slot have played it. Raises WorkerError when one of the
     processes ends too early."""
     with contextlib.ExitStack() as stack:
@@ -100,7 +102,7 @@ def check(env_ids: Sequence[str], definitions: tuple[Entry, ...], steps: int = S
             here, there = (msgspec.json.decode(line, type=CheckResult) for line in lines)
             own = tuple(each for each in definitions if each.id == env_id)
             slot = InASlot() if here.faults else in_a_slot(env_id, own)
-            yield Checked(here, there, slot)
+            yield CheckedEnvironment(here, there, slot)
 
 
 @contextlib.contextmanager
@@ -239,13 +241,13 @@ def command(
         raise typer.Exit(any(known[each].verdict != "ok" for each in wanted))
 
 
-def read_checked(results: Path) -> dict[str, Checked]:
+def read_checked(results: Path) -> dict[str, CheckedEnvironment]:
     """Results in the file, by environment id. Skips truncated lines, so that those environments are played again."""
-    by_env: dict[str, Checked] = {}
+    by_env: dict[str, CheckedEnvironment] = {}
     data = read_given(results, f"--results {results}") if results.exists() else b""
     for line in data.splitlines():
         try:
-            checked = msgspec.json.decode(line, type=Checked)
+            checked = msgspec.json.decode(line, type=CheckedEnvironment)
         except msgspec.MsgspecError:
             continue
         by_env[checked.here.env] = checked

@@ -39,10 +39,10 @@ from evopolicy_common.wire.credentials import read_ready
 from evopolicy_worker import capabilities, check_env, environments, setup
 from evopolicy_worker.capabilities import Capabilities, describe_all, log_missing
 from evopolicy_worker.doctor import best_tier, examine
-from evopolicy_worker.environments.interface.calls import USUAL, Limits
+from evopolicy_worker.environments.interface.calls import USUAL, EnvironmentLimits
 from evopolicy_worker.environments.interface.fingerprint import fingerprint
 from evopolicy_worker.slots.slot import SANDBOXED, Slot, available_tiers, try_out, why_not
-from evopolicy_worker.supervisor import MAX_PREPARED, Options, Supervisor
+from evopolicy_worker.supervisor import MAX_PREPARED, Supervisor, WorkerOptions
 
 app = App()
 
@@ -167,7 +167,7 @@ def work(
         for tier in needed:
             if tier not in tiers:
                 raise _refused(tier, missing.get(tier), unsandboxed=unsandboxed)
-        limits = Limits(call_s=env_timeout, memory_bytes=env_memory << 20)
+        limits = EnvironmentLimits(call_s=env_timeout, memory_bytes=env_memory << 20)
         with scratch_folder("worker") as scratch:
             own = (name, wanted, tiers, missing, slots, packages, limits, scratch, grace)
             try:
@@ -247,7 +247,7 @@ async def _run(
     missing: dict[Tier, str],
     n_slots: int | None,
     packages: tuple[str, ...],
-    limits: Limits,
+    limits: EnvironmentLimits,
     scratch: Path,
     grace_s: float,
 ) -> None:
@@ -317,7 +317,7 @@ async def _run(
             probe=probe,
             describe=describe,
         )
-        options = Options(
+        options = WorkerOptions(
             name=name or default_name(joining),
             slots=len(taken),
             fingerprint=msgspec.structs.replace(own, packages=own.packages | importable),

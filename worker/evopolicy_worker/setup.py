@@ -24,7 +24,7 @@ import typer
 import evopolicy_common
 from evopolicy_common import catalogue
 from evopolicy_common.catalogue import installs
-from evopolicy_common.catalogue.installs import Install, Made
+from evopolicy_common.catalogue.installs import Install, MadeEnvironment
 from evopolicy_common.cli.conventions import fail_on_our_errors
 from evopolicy_common.errors import ConfigError, MachineError
 from evopolicy_common.installation import source
@@ -96,7 +96,7 @@ def _make(wanted: Mapping[str, Install], folder: Path) -> None:
     """Makes the virtual environment in `folder`, in place of an earlier one. Raises ConfigError or MachineError."""
     needed = max(each.megabytes for each in wanted.values()) + 60 * len(wanted)
     check_writable(folder, installs.FOLDER_VARIABLE, least_bytes=needed << 20)
-    made = Made(families=tuple(wanted), version=evopolicy_common.__version__)
+    made = MadeEnvironment(families=tuple(wanted), version=evopolicy_common.__version__)
     if folder.exists():
         shutil.rmtree(folder)
     folder.mkdir(parents=True)
@@ -160,7 +160,7 @@ def last_line(output: str) -> str:
     return one_line((errors or lines or ["no output"])[-1])[:300]
 
 
-def _try(made: Made, family: str) -> None:
+def _try(made: MadeEnvironment, family: str) -> None:
     """Plays one of the family's environments for a few steps. Raises ConfigError when that fails."""
     env_id = next((each for each in catalogue.entries() if installs.family_of(each) == family), None)
     if env_id is None:

@@ -72,7 +72,7 @@ MAX_PREPARED = 4
 """A worker that offers at most this many environments has its slots import all their simulators before work arrives."""
 
 
-class Options(msgspec.Struct, frozen=True, kw_only=True):
+class WorkerOptions(msgspec.Struct, frozen=True, kw_only=True):
     name: str
     slots: int
     fingerprint: Fingerprint
@@ -90,7 +90,7 @@ class Supervisor:
     def __init__(
         self,
         link: Link,
-        options: Options,
+        options: WorkerOptions,
         capabilities: Capabilities,
         make_slot: Callable[[int, Tier], Slot],
     ) -> None:

@@ -13,7 +13,7 @@ from typing import Any, Literal
 import msgspec
 
 from evopolicy_common.errors import DECODE_ERRORS
-from evopolicy_common.records.agent_log import Part, parts
+from evopolicy_common.records.agent_log import LogPart, parts
 from evopolicy_common.regular_files import open_regular
 
 MAX_LOG_BYTES = 64 << 20
@@ -27,7 +27,7 @@ _NOTES = ("turn_failed", "paused", "permission", "log_full")
 
 
 @dataclass(kw_only=True)
-class Call:
+class LoggedCall:
     id: str
     """Unique within the log."""
     name: str
@@ -38,7 +38,7 @@ class Call:
 class Result:
     """The result of one tool call."""
 
-    call: Call | None
+    call: LoggedCall | None
     """None when the log does not show the call."""
     text: str
     failed: bool
@@ -51,7 +51,7 @@ class LogStep:
     source: Literal["user", "agent", "system"]
     texts: list[str] = field(default_factory=list)
     reasoning: list[str] = field(default_factory=list)
-    calls: list[Call] = field(default_factory=list)
+    calls: list[LoggedCall] = field(default_factory=list)
     results: list[Result] = field(default_factory=list)
     at: str | None = None
     """ISO 8601, where the log tells it."""
@@ -81,7 +81,7 @@ def read_steps(path: Path) -> list[LogStep]:
 class _Log:
     def __init__(self) -> None:
         self.steps: list[LogStep] = []
-        self._calls: dict[str, tuple[LogStep, Call]] = {}
+        self._calls: dict[str, tuple[LogStep, LoggedCall]] = {}
         """The latest call of each id in the log: a resumed program begins to count anew."""
         self._n_calls = 0
 
@@ -122,7 +122,7 @@ class _Log:
                     elif text := _text(part.value).strip():
                         (step.texts if part.kind == "text" else step.reasoning).append(text)
 
-    def call(self, step: LogStep, part: Part) -> None:
+    def call(self, step: LogStep, part: LogPart) -> None:
         self._n_calls += 1
         unique = part.id
         while not unique or unique in self._calls:
@@ -131,11 +131,11 @@ class _Log:
         arguments = {"command": part.value} if part.name == "shell" else part.value
         if not isinstance(arguments, dict):
             arguments = {} if arguments is None else {"input": arguments}
-        call = Call(id=unique, name=part.name or "tool", arguments=arguments)
+        call = LoggedCall(id=unique, name=part.name or "tool", arguments=arguments)
         step.calls.append(call)
         self._calls[part.id] = self._calls[unique] = step, call
 
-    def result(self, part: Part) -> None:
+    def result(self, part: LogPart) -> None:
         step, call = self._calls.get(part.id) or (self.step("system"), None)
         step.results.append(Result(call=call, text=_text(part.value), failed=part.failed))
 

@@ -39,7 +39,7 @@ from evopolicy_common import catalogue
 from evopolicy_common.errors import ConfigError, EvopolicyError, raised_as
 from evopolicy_common.processes import proc
 from evopolicy_common.records.words import in_words
-from evopolicy_gateway.agents.client import Client, ProtocolError, Refusal
+from evopolicy_gateway.agents.client import Client, GatewayError, RefusedSubmit
 from evopolicy_gateway.harnesses.coding_agents import session
 from evopolicy_gateway.relay.usage import Usage
 from evopolicy_gateway.run.lifecycle import RunLifecycle
@@ -331,9 +331,9 @@ def submit_episodes() -> Tool:
             verdict = await anyio.to_thread.run_sync(
                 live.client.submit, env_instances, abandon_on_cancel=True
             )
-        except ProtocolError as error:
+        except GatewayError as error:
             raise ToolError(str(error)) from error
-        if isinstance(verdict, Refusal):
+        if isinstance(verdict, RefusedSubmit):
             raise ToolError(f"{verdict.status}: {verdict.message}")
         text = (live.folder.feedback / verdict.name / "summary.json").read_text()
         return f"feedback/{verdict.name}: {verdict.status}\n{text[:_MAX_READ]}"
@@ -384,7 +384,7 @@ def _remaining() -> int:
     """Episodes left; 0 once the run is closed."""
     try:
         state = _of_sample().client.info()["state"]
-    except ProtocolError:
+    except GatewayError:
         return 0
     return 0 if state["is_finalized"] else int(state["remaining_budget"])
 

@@ -132,7 +132,7 @@ async def _play(
     passed = [name for name in harness.variables if is_secret(name)]
     if order.jail is not None:
         passed += order.jail.settings.environment
-        kept = inputs.Kept()
+        kept = inputs.KeptInputs()
         if config is not None and order.inputs:
             folder, started_in = Path(order.jail.private) / "inputs", Path(order.started_in)
             kept = await asyncio.to_thread(

@@ -24,12 +24,12 @@ _OVER = ("run_closed", "cancelled")
 """Statuses of a final 409: no more submits are accepted. Any other 409 is temporary."""
 
 
-class ProtocolError(Exception):
+class GatewayError(Exception):
     """The gateway's reply violates the protocol, or the gateway was unreachable for too long."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Refusal:
+class RefusedSubmit:
     """A submit that was refused and not charged."""
 
     status: str
@@ -38,7 +38,7 @@ class Refusal:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Verdict:
+class ChargedSubmit:
     """The result of a submit that was charged."""
 
     name: str
@@ -66,7 +66,7 @@ class Client:
 
     @classmethod
     def from_environment(cls) -> Client:
-        """A client for the URLs in the `EVOPOLICYGYM_*` variables. Raises ProtocolError when one is missing."""
+        """A client for the URLs in the `EVOPOLICYGYM_*` variables. Raises GatewayError when one is missing."""
         try:
             return cls(
                 info_url=os.environ["EVOPOLICYGYM_INFO_URL"],
@@ -75,7 +75,7 @@ class Client:
                 token=os.environ.get("EVOPOLICYGYM_TOKEN", ""),
             )
         except KeyError as error:
-            raise ProtocolError(f"{error} is not set; it is started by a gateway") from None
+            raise GatewayError(f"{error} is not set; it is started by a gateway") from None
 
     def info(self) -> dict[str, Any]:
         """The present content of `/info`."""
@@ -85,10 +85,10 @@ class Client:
         """The task's text, Markdown."""
         status, body = self._request(self.task_url)
         if status != 200:
-            raise ProtocolError(f"GET {self.task_url} answered {status}: {body[:200]!r}")
+            raise GatewayError(f"GET {self.task_url} answered {status}: {body[:200]!r}")
         return body.decode("utf-8", "replace")
 
-    def submit(self, env_instances: list[int], key: str | None = None) -> Verdict | Refusal:
+    def submit(self, env_instances: list[int], key: str | None = None) -> ChargedSubmit | RefusedSubmit:
         """Submits the present `system/` on these train cases and waits for the verdict. `key`: of a submit that may
         have been sent before; None: a new one."""
         key = key or uuid.uuid4().hex
@@ -103,7 +103,7 @@ class Client:
         if status in (400, 409):
             refusal = self._json(answer)
             message = (refusal.get("error") or {}).get("message", "")
-            return Refusal(status=str(refusal.get("status", "refused")), message=str(message))
+            return RefusedSubmit(status=str(refusal.get("status", "refused")), message=str(message))
         reply = self._expect_json(status, answer)
         wait_s, index = self.poll_s, int(reply["submit_id"])
         while reply.get("summary") is None:
@@ -111,11 +111,11 @@ class Client:
             wait_s = min(wait_s * 1.2, 8 * self.poll_s)
             reply = self._expect_json(*self._request(_extended(self.submit_url, path=str(index))))
         name = str(reply["feedback"]).rpartition("/")[2]
-        return Verdict(name=name, status=str(reply["status"]), summary=reply["summary"])
+        return ChargedSubmit(name=name, status=str(reply["status"]), summary=reply["summary"])
 
     def _expect_json(self, status: int, body: bytes) -> dict[str, Any]:
         if status not in (200, 202):
-            raise ProtocolError(f"unexpected answer {status}: {body[:200]!r}")
+            raise GatewayError(f"unexpected answer {status}: {body[:200]!r}")
         return self._json(body)
 
     @staticmethod
@@ -123,9 +123,9 @@ class Client:
         try:
             value = json.loads(body)
         except ValueError as error:
-            raise ProtocolError(f"not JSON: {body[:200]!r}") from error
+            raise GatewayError(f"not JSON: {body[:200]!r}") from error
         if not isinstance(value, dict):
-            raise ProtocolError(f"not a JSON object: {body[:200]!r}")
+            raise GatewayError(f"not a JSON object: {body[:200]!r}")
         return value
 
     def _request(
@@ -147,7 +147,7 @@ class Client:
             except (OSError, HTTPException) as error:
                 reason = error
             if self.clock() >= give_up_at:
-                raise ProtocolError(f"{url} did not answer for {self.timeout_s:g} s: {reason}") from reason
+                raise GatewayError(f"{url} did not answer for {self.timeout_s:g} s: {reason}") from reason
             self.sleep(self.poll_s)
 
 
@@ -165,7 +165,7 @@ def exit_after(agent: str, play: Callable[[Client], int]) -> NoReturn:
     """Exits with 0 when `play` returns that any submit was accepted, and with 1 otherwise, or without a gateway."""
     try:
         accepted = play(Client.from_environment())
-    except ProtocolError as error:
+    except GatewayError as error:
         print(f"{agent}: {error}", file=sys.stderr)
         raise SystemExit(1) from None
     raise SystemExit(0 if accepted else 1)

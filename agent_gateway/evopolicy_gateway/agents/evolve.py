@@ -32,7 +32,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from evopolicy_gateway.agents.client import Client, ProtocolError, Refusal, exit_after
+from evopolicy_gateway.agents.client import Client, GatewayError, RefusedSubmit, exit_after
 
 Schema = dict[str, Any]
 Vector = NDArray[np.float64]
@@ -226,7 +226,7 @@ def observations(episode: Path) -> Iterator[Any]:
             yield json.loads(line)["obs"]
 
 
-class Agent:
+class EvolveAgent:
     """One run of the agent in one workspace. ValueError for spaces that it cannot read or choose from."""
 
     def __init__(self, client: Client, workspace: Path, identity: str) -> None:
@@ -249,7 +249,7 @@ class Agent:
         self._n_submits, self._is_over = 0, False
 
     def run(self) -> bool:
-        """Spends the budget and returns whether a submit was accepted. ProtocolError when the gateway stays
+        """Spends the budget and returns whether a submit was accepted. GatewayError when the gateway stays
         unreachable, or refuses a submit."""
         check = max(self._least, 1)
         size = max(self._least, min(self._most, max(2, min(16, self._budget // 6))))
@@ -280,10 +280,10 @@ class Agent:
             # The same key after a restart: a submit that is being played is not sent twice.
             key = uuid.uuid5(uuid.NAMESPACE_URL, f"{self._identity} {index}").hex
             answer = self._client.submit(cases, key)
-            if isinstance(answer, Refusal):
+            if isinstance(answer, RefusedSubmit):
                 self._n_submits, self._is_over = index, True
                 if answer.status not in CLOSED:
-                    raise ProtocolError(f"refused, {answer.status}: {answer.message}")
+                    raise GatewayError(f"refused, {answer.status}: {answer.message}")
                 return None
             folders = [self._feedback / answer.name]
         summary = json.loads((folders[0] / "summary.json").read_text(encoding="utf-8"))
@@ -306,7 +306,7 @@ def main() -> None:
     workspace = Path.cwd()
     identity = "/".join(workspace.parts[-4:-1])
     try:
-        exit_after("evolve", lambda client: Agent(client, workspace, identity).run())
+        exit_after("evolve", lambda client: EvolveAgent(client, workspace, identity).run())
     except ValueError as error:
         print(f"evolve: {error}; --agent random plays it", file=sys.stderr)
         raise SystemExit(1) from None

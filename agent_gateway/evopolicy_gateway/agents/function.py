@@ -12,7 +12,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, NoReturn
 
-from evopolicy_gateway.agents.client import Client, Refusal, exit_after
+from evopolicy_gateway.agents.client import Client, RefusedSubmit, exit_after
 
 RESULT = "result.json"
 
@@ -66,7 +66,7 @@ class Workspace:
         closed).
         """
         verdict = self._client.submit([int(case) for case in cases])
-        if isinstance(verdict, Refusal):
+        if isinstance(verdict, RefusedSubmit):
             raise SubmitRefusedError(verdict.status, verdict.message)
         self.n_submits += 1
         return verdict.summary

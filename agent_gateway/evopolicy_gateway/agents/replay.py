@@ -17,7 +17,7 @@ import sys
 from collections.abc import Collection
 from pathlib import Path
 
-from evopolicy_gateway.agents.client import Client, ProtocolError, Refusal, exit_after
+from evopolicy_gateway.agents.client import Client, GatewayError, RefusedSubmit, exit_after
 
 METADATA = frozenset({"_meta.json", "metrics.json"})
 """Equals `records.checkpoints.METADATA`; that module is not in an agent's jail, which shows only the agents."""
@@ -78,14 +78,14 @@ def _copy(source: Path, target: Path, left_out: Collection[str]) -> None:
 
 
 def submit_all(client: Client, folder: Path, workspace: Path) -> int:
-    """Submits all policies and returns the number of accepted submits. Raises ProtocolError if the gateway is
+    """Submits all policies and returns the number of accepted submits. Raises GatewayError if the gateway is
     unreachable."""
     info = client.info()
     n_cases = int(info["env_meta"]["n_env_instances"])
     folder = folder_for(folder, str(info["env_meta"]["env"]))
     policies = policies_in(folder)
     if not policies:
-        raise ProtocolError(f"{folder} holds no policy: neither policy.py nor folders with one")
+        raise GatewayError(f"{folder} holds no policy: neither policy.py nor folders with one")
     plan = shares(
         int(info["state"]["remaining_budget"]),
         len(policies),
@@ -99,7 +99,7 @@ def submit_all(client: Client, folder: Path, workspace: Path) -> int:
     for policy, n_episodes in zip(policies, plan, strict=False):
         stage(policy, workspace / "system")
         verdict = client.submit([index % n_cases for index in range(n_episodes)])
-        if isinstance(verdict, Refusal):
+        if isinstance(verdict, RefusedSubmit):
             print(f"{policy}: refused, {verdict.status}: {verdict.message}", flush=True)
             continue
         n_taken += 1

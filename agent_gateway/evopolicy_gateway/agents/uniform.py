@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from evopolicy_gateway.agents.client import Client, Refusal, exit_after
+from evopolicy_gateway.agents.client import Client, RefusedSubmit, exit_after
 
 POLICY = '''"""Uniform random actions on any action space; elements without a bound are normal."""
 
@@ -96,7 +96,7 @@ def submit_random(client: Client, workspace: Path) -> bool:
     n_episodes = min(int(info["state"]["remaining_budget"]), int(info["max_episodes_per_submit"]))
     (workspace / "system" / "policy.py").write_text(POLICY, encoding="utf-8")
     verdict = client.submit([index % n_cases for index in range(n_episodes)])
-    if isinstance(verdict, Refusal):
+    if isinstance(verdict, RefusedSubmit):
         print(f"refused, {verdict.status}: {verdict.message}", flush=True)
         return False
     print(f"{verdict.name}: {verdict.status} {verdict.summary.get('mean_return')}", flush=True)

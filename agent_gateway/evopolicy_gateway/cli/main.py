@@ -13,7 +13,7 @@ from typing import Any
 
 import typer
 
-from evopolicy_common.cli.frame import App, Group, Version, run_app
+from evopolicy_common.cli.frame import App, CommandGroup, Version, run_app
 from evopolicy_gateway.processes import trees as processes
 
 _MODULES = {
@@ -105,7 +105,7 @@ class _Commands(Mapping[str, Any]):
         return len(HELPS)
 
 
-class _TopLevel(Group):
+class _TopLevel(CommandGroup):
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)
         self.commands = _Commands()  # type: ignore[assignment]  # nobody adds to it

@@ -19,7 +19,7 @@ from evopolicy_common.errors import ConfigError
 from evopolicy_common.processes.packages import checked_names
 from evopolicy_common.wire.credentials import local_state_dir
 from evopolicy_gateway.declared import SAME, SET, Declared, Several, declared, set_values
-from evopolicy_gateway.operator.cluster import Cluster
+from evopolicy_gateway.operator.cluster import ChosenCluster
 from evopolicy_gateway.run.run_options import ClusterOptions
 
 RUN, CLUSTER = "Run", ClusterOptions.group
@@ -60,7 +60,7 @@ _LOCAL_ONLY = {
 
 def cluster_of(
     given: ClusterOptions, connect: list[str] | None, file: Path | None, *, local: bool | None = None
-) -> Cluster:
+) -> ChosenCluster:
     """The cluster that a command plays on; `local` None: its own unless one is named. ConfigError for an option that
     does not go with it."""
     local = not (connect or file) if local is None else local
@@ -69,11 +69,11 @@ def cluster_of(
         for name, text in _LOCAL_ONLY.items():
             if getattr(given, name):
                 raise ConfigError(text)
-        return Cluster(connect=tuple(connect or ()), file=file)
+        return ChosenCluster(connect=tuple(connect or ()), file=file)
     if given.fresh and given.state is not None:
         raise ConfigError(f"--fresh and --state {given.state}: give only one of them")
     state = None if given.fresh else given.state or local_state_dir()
-    return Cluster(local=msgspec.structs.replace(given, state=state, policy_package=packages))
+    return ChosenCluster(local=msgspec.structs.replace(given, state=state, policy_package=packages))
 
 
 class Shown(NamedTuple):

@@ -21,7 +21,7 @@ from evopolicy_gateway import shipped
 from evopolicy_gateway.cli import options
 from evopolicy_gateway.cli.options import Of, Shown, spread
 from evopolicy_gateway.jail.settings import JailSettings
-from evopolicy_gateway.operator.cluster import Cluster
+from evopolicy_gateway.operator.cluster import ChosenCluster
 from evopolicy_gateway.run import recorded_agent
 from evopolicy_gateway.run.plan import Plan, check_apart
 from evopolicy_gateway.run.run_options import (
@@ -56,7 +56,7 @@ def run(
 
     Starts the run's gateway and agent on this machine, and ends when run.json is written.
     """
-    where = Cluster(connect=tuple(connect or ()), file=credentials_file, patient=given.resume)
+    where = ChosenCluster(connect=tuple(connect or ()), file=credentials_file, patient=given.resume)
     held = jail.of_remote_agent() if given.agent == listener.AGENT else jail
     agent_host = listener.agent_host_of(given.agent, served.agent_host)
     plans = _checked(given.plans([one_environment(env)], held, agent_host, served.listener()))
@@ -230,7 +230,7 @@ def _checked(plans: list[Plan]) -> list[Plan]:
     return plans
 
 
-def _play(plans: list[Plan], where: Cluster, parallel: int, as_json: bool) -> None:
+def _play(plans: list[Plan], where: ChosenCluster, parallel: int, as_json: bool) -> None:
     where = msgspec.structs.replace(where, unjailed=_unjailed(plans))
     console = terminal(stderr=as_json)
     try:

@@ -19,7 +19,7 @@ from evopolicy_common.errors import ConfigError
 from evopolicy_common.logs import log
 from evopolicy_common.processes.preflight import foreseen
 from evopolicy_gateway.processes import child_messages
-from evopolicy_gateway.processes.child_messages import Orders, Progress, Ready, Waits
+from evopolicy_gateway.processes.child_messages import Orders, Ready, TrainProgress, Waits
 from evopolicy_gateway.run.gateway import Gateway
 from evopolicy_gateway.run_folder.layout import RunFolder, folder_of
 from evopolicy_gateway.submits.pipeline import SubmitPipeline
@@ -77,17 +77,17 @@ async def _serve(folder: RunFolder) -> bool:
 async def _listen(gateway: Gateway) -> None:
     orders = Orders()
     while (order := await orders.next()) is not None:
-        if isinstance(order, child_messages.CloseRun):
+        if isinstance(order, child_messages.CloseGateway):
             gateway.tell(order)
     gateway.tell(None)
 
 
-def progress_of(machine: TicketMachine) -> Progress:
+def progress_of(machine: TicketMachine) -> TrainProgress:
     """A run in the operator's live view."""
     settled = [ticket for ticket in machine.tickets if ticket.status is not None]
     means = [ticket.mean_return for ticket in settled if ticket.mean_return is not None]
     running, last = machine.in_flight, settled[-1] if settled else None
-    return Progress(
+    return TrainProgress(
         episode_budget=machine.run.episode_budget,
         remaining_budget=machine.state.remaining_budget,
         n_submits=machine.state.n_submits,

@@ -33,7 +33,7 @@ from evopolicy_common.records.suite_folder import FINISHED, INDEX, Index
 from evopolicy_common.wire.credentials import SWEEP_STATE
 from evopolicy_gateway.cli import options
 from evopolicy_gateway.cli.options import Of, Shown, spread
-from evopolicy_gateway.operator.cluster import Cluster, connected
+from evopolicy_gateway.operator.cluster import ChosenCluster, connected
 from evopolicy_gateway.run.plan import Plan
 from evopolicy_gateway.run.run_options import ClusterOptions, RunOptions
 from evopolicy_gateway.run_folder.locks import alone
@@ -120,7 +120,7 @@ async def _suite(
     suite: SuiteFile,
     runs: Sequence[Plan],
     root: Path,
-    where: Cluster,
+    where: ChosenCluster,
     changed: Changed,
     dry_run: bool,
     as_json: bool,

@@ -47,12 +47,12 @@ class McpServer(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
     """`HOST` (port 443) or `HOST:PORT`; the jail then allows them to the whole agent."""
 
 
-class File(NamedTuple):
+class InputFile(NamedTuple):
     data: bytes
     executable: bool
 
 
-class Server(msgspec.Struct, frozen=True):
+class ServerCommand(msgspec.Struct, frozen=True):
     """How to start an MCP server in the jail."""
 
     command: str
@@ -64,8 +64,8 @@ class Content(NamedTuple):
     """One input with its files, by their paths below its folder."""
 
     recorded: AgentInput
-    files: Mapping[str, File]
-    server: Server | None = None
+    files: Mapping[str, InputFile]
+    server: ServerCommand | None = None
 
 
 def read_inputs(skills: Sequence[str], servers: Mapping[str, McpServer], started_in: Path) -> list[Content]:
@@ -103,7 +103,7 @@ def _server(name: str, server: McpServer, started_in: Path) -> Content:
                 root = roots[word] = place
             word = os.path.normpath(f"{IN_JAIL}/mcp/{name}/{root.name}/{place.relative_to(root)}")
         words.append(word)
-    files: dict[str, File] = {}
+    files: dict[str, InputFile] = {}
     for path, root in roots.items():
         if any(other.name == root.name and other != root for other in roots.values()):
             raise ConfigError(f"{field}: two of its files or folders are named {root.name!r}; rename one")
@@ -118,7 +118,7 @@ def _server(name: str, server: McpServer, started_in: Path) -> Content:
         digest = hashlib.file_digest(file, "sha256").hexdigest()
     about = [os.path.basename(program), digest, words, sorted(server.environment.items())]
     recorded = AgentInput(kind="mcp", name=name, digest=_digest(files, about), hosts=server.hosts)
-    return Content(recorded, files, Server(program, tuple(words), server.environment))
+    return Content(recorded, files, ServerCommand(program, tuple(words), server.environment))
 
 
 def _check_name(field: str, name: str) -> None:
@@ -145,7 +145,7 @@ def _below(field: str, path: str, started_in: Path) -> Path:
     return whole
 
 
-def _files(field: str, root: Path, prefix: str) -> Iterator[tuple[str, File]]:
+def _files(field: str, root: Path, prefix: str) -> Iterator[tuple[str, InputFile]]:
     """The files at `root`, by path from `prefix` on. ConfigError for links, devices, and too much."""
     remaining, n, pending = MAX_BYTES, 0, [(root, prefix)]
     while pending:
@@ -171,10 +171,10 @@ def _files(field: str, root: Path, prefix: str) -> Iterator[tuple[str, File]]:
             raise ConfigError(
                 f"{field}: more than {MAX_BYTES >> 20} MiB or {MAX_FILES} files; leave out what the agent does not need"
             )
-        yield name, File(data, bool(mode & 0o100))
+        yield name, InputFile(data, bool(mode & 0o100))
 
 
-def _digest(files: Mapping[str, File], about: object = None) -> str:
+def _digest(files: Mapping[str, InputFile], about: object = None) -> str:
     listed = [
         (name, hashlib.sha256(file.data).hexdigest(), file.executable) for name, file in sorted(files.items())
     ]

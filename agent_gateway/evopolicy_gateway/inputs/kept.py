@@ -16,18 +16,18 @@ from evopolicy_common.errors import ConfigError
 from evopolicy_common.processes.scratch import remove_tree
 from evopolicy_common.records.blobs import write_atomically
 from evopolicy_common.records.run_record import AgentInput
-from evopolicy_gateway.inputs.declared import IN_JAIL, Content, McpServer, Server, read_inputs
+from evopolicy_gateway.inputs.declared import IN_JAIL, Content, McpServer, ServerCommand, read_inputs
 
 MCP_FILE = f"{IN_JAIL}/mcp.json"
 """The servers in the form that many CLIs read, `{"mcpServers": {…}}`."""
 
 
-class Kept(msgspec.Struct, frozen=True, kw_only=True):
+class KeptInputs(msgspec.Struct, frozen=True, kw_only=True):
     """The inputs of one run's agent."""
 
     folder: Path | None = None
     skills: tuple[str, ...] = ()
-    servers: Mapping[str, Server] = {}
+    servers: Mapping[str, ServerCommand] = {}
 
     def __bool__(self) -> bool:
         return bool(self.skills or self.servers)
@@ -48,7 +48,7 @@ def keep(
     started_in: Path,
     folder: Path,
     expected: Sequence[AgentInput],
-) -> Kept:
+) -> KeptInputs:
     """The copies in `folder`, made if missing. ConfigError when the inputs differ from `expected`."""
     declared = read_inputs(skills, servers, started_in)
     if changed := {(each.kind, each.name) for each in {each.recorded for each in declared} ^ set(expected)}:
@@ -74,14 +74,14 @@ def keep(
                 " --overwrite"
             )
     skills_named = tuple(each.recorded.name for each in declared if each.recorded.kind == "skill")
-    return Kept(folder=folder, skills=skills_named, servers=started)
+    return KeptInputs(folder=folder, skills=skills_named, servers=started)
 
 
 def _place(folder: Path, about: AgentInput) -> Path:
     return folder / ("skills" if about.kind == "skill" else "mcp") / about.name
 
 
-def _write(declared: Sequence[Content], servers: dict[str, Server], folder: Path) -> None:
+def _write(declared: Sequence[Content], servers: dict[str, ServerCommand], folder: Path) -> None:
     for each in declared:
         for name, file in each.files.items():
             path = _place(folder, each.recorded) / name

@@ -16,7 +16,7 @@ from evopolicy_gateway.jail.installs import needs_of
 from evopolicy_gateway.jail.proxy import JailProxy
 from evopolicy_gateway.jail.settings import HTTPS, JailSettings, absolute, host, without_proxy
 from evopolicy_gateway.jail.syscalls import filter_program
-from evopolicy_gateway.jail.view import ENTRY, View
+from evopolicy_gateway.jail.view import ENTRY, JailView
 
 _PASSED = frozenset(
     (
@@ -165,7 +165,7 @@ class Jail:
         self._hosts = frozenset(map(host, (*HARNESS_HOSTS.get(harness, ()), *hosts, *settings.hosts)))
         ports = [*map(_port, urls.values()), *(port for name, port in self._hosts if name in _LOOPBACK_NAMES)]
         self._forwards = {port: ("127.0.0.1", port) for port in ports}
-        self._view = View(
+        self._view = JailView(
             workspace=workspace,
             shown=Path(order.shown) if order.shown else workspace,
             private=Path(order.private),

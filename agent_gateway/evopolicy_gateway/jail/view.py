@@ -41,7 +41,7 @@ _COUNTERS = (
 )
 
 
-class View(msgspec.Struct, frozen=True, kw_only=True):
+class JailView(msgspec.Struct, frozen=True, kw_only=True):
     """The files that one run's agent sees. Paths are absolute; files of this machine appear at their own paths."""
 
     workspace: Path

@@ -26,7 +26,7 @@ CONNECT_S = 10.0
 """Patience with a coordinator that was not reached yet, seconds."""
 
 
-class Cluster(msgspec.Struct, frozen=True, kw_only=True):
+class ChosenCluster(msgspec.Struct, frozen=True, kw_only=True):
     """Which cluster a command uses: a local one, the named one, or this machine's own."""
 
     connect: tuple[str, ...] = ()
@@ -64,7 +64,7 @@ class Reached(NamedTuple):
 
 
 @contextlib.asynccontextmanager
-async def reached(where: Cluster, workers: Workers | None = None) -> AsyncIterator[Reached]:
+async def reached(where: ChosenCluster, workers: Workers | None = None) -> AsyncIterator[Reached]:
     """Connects to the cluster; a local one is started first, with `workers`."""
     async with contextlib.AsyncExitStack() as stack:
         local: LocalCluster | None = None
@@ -93,7 +93,7 @@ async def reached(where: Cluster, workers: Workers | None = None) -> AsyncIterat
 
 @contextlib.asynccontextmanager
 async def connected(
-    where: Cluster, env_ids: Sequence[str], tiers: Collection[Tier]
+    where: ChosenCluster, env_ids: Sequence[str], tiers: Collection[Tier]
 ) -> AsyncIterator[tuple[Operations, Credentials, asyncio.Future[None] | None]]:
     """Yields operations, gateway credentials, and a future that fails with a local cluster."""
     end_on_sigterm()

@@ -25,7 +25,7 @@ from evopolicy_common.records.episodes import rendered
 from evopolicy_common.records.policies.bundles import Bundle
 from evopolicy_common.records.policies.checkpoints import bundle_of
 from evopolicy_common.terminal import one_line, say, say_json
-from evopolicy_gateway.operator.cluster import Cluster, connected
+from evopolicy_gateway.operator.cluster import ChosenCluster, connected
 from evopolicy_gateway.run.operations import Operations
 from evopolicy_gateway.submits.formatting import cut_text, failure_text
 
@@ -81,7 +81,9 @@ class TrialResult(msgspec.Struct, frozen=True, kw_only=True):
     """The cases derive from the secret of a temporary cluster: another call has other cases under the same ids."""
 
 
-async def try_policy(bundle: Bundle, message: Evaluate, out: Path, where: Cluster, *, as_json: bool) -> int:
+async def try_policy(
+    bundle: Bundle, message: Evaluate, out: Path, where: ChosenCluster, *, as_json: bool
+) -> int:
     """Plays the policy on train cases and prints the results; returns 1 if it failed in an episode, else 0.
     `message`: of `evaluation`; `out`: folder for trajectories."""
     check_writable(out, "--out")
@@ -120,7 +122,7 @@ async def _outcomes(operations: Operations, message: Evaluate, console: Terminal
 
 
 async def _result(
-    message: Evaluate, where: Cluster, operations: Operations, console: Terminal, out: Path
+    message: Evaluate, where: ChosenCluster, operations: Operations, console: Terminal, out: Path
 ) -> TrialResult:
     """Plays the cases, and writes their files into a new folder in `out`."""
     outcomes = await _outcomes(operations, message, console)

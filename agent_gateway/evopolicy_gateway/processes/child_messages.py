@@ -30,29 +30,29 @@ class RelayAddress(msgspec.Struct, frozen=True, kw_only=True):
     token: str
 
 
-class Event(msgspec.Struct, frozen=True, kw_only=True, tag_field="event"):
+class FromChild(msgspec.Struct, frozen=True, kw_only=True, tag_field="event"):
     """Child to parent."""
 
 
-class Ready(Event, frozen=True, kw_only=True, tag="ready"):
+class Ready(FromChild, frozen=True, kw_only=True, tag="ready"):
     variables: dict[str, str]
     """The `EVOPOLICYGYM_*` variables that hold URLs."""
     notes: tuple[str, ...] = ()
     """Notes for the operator about the opened run."""
     held_s: float = 0.0
-    """As in `Progress`."""
+    """As in `TrainProgress`."""
     permit_s: float = 0.0
     """Seconds spent waiting for the agent's permit."""
 
 
-class Waits(Event, frozen=True, kw_only=True, tag="waits"):
+class Waits(FromChild, frozen=True, kw_only=True, tag="waits"):
     """The gateway waits: before `Ready` for the agent's permit, at the end for the agent's end."""
 
     waits_for: str
     """Empty: the wait is over."""
 
 
-class Progress(Event, frozen=True, kw_only=True, tag="progress"):
+class TrainProgress(FromChild, frozen=True, kw_only=True, tag="progress"):
     """Progress of a run's train side."""
 
     episode_budget: int
@@ -82,12 +82,12 @@ class Progress(Event, frozen=True, kw_only=True, tag="progress"):
     """The operator has cancelled the run."""
 
 
-class AgentTurn(Event, frozen=True, kw_only=True, tag="turn"):
+class AgentTurn(FromChild, frozen=True, kw_only=True, tag="turn"):
     turn: int
     text: str
 
 
-class AgentDoing(Event, frozen=True, kw_only=True, tag="doing"):
+class AgentDoing(FromChild, frozen=True, kw_only=True, tag="doing"):
     """The agent's activity changed, it used more tokens, or it waits for its provider."""
 
     action: str = ""
@@ -99,20 +99,20 @@ class AgentDoing(Event, frozen=True, kw_only=True, tag="doing"):
     provider: str = ""
 
 
-class AgentUsed(Event, frozen=True, kw_only=True, tag="agent_used"):
+class AgentUsed(FromChild, frozen=True, kw_only=True, tag="agent_used"):
     """The agent's use of its wall limit and its machine since it was started."""
 
     used_s: float
     resources: AgentResources
 
 
-class AgentSurvives(Event, frozen=True, kw_only=True, tag="agent_survives"):
+class AgentSurvives(FromChild, frozen=True, kw_only=True, tag="agent_survives"):
     """The agent was ended, but the kernel holds killed processes of it; `AgentEnded` follows when they are gone."""
 
     pids: tuple[int, ...]
 
 
-class AgentEnded(Event, frozen=True, kw_only=True, tag="agent_ended"):
+class AgentEnded(FromChild, frozen=True, kw_only=True, tag="agent_ended"):
     """The agent and all its children are gone."""
 
     reason: str
@@ -128,25 +128,25 @@ class AgentEnded(Event, frozen=True, kw_only=True, tag="agent_ended"):
     """A failed agent's last lines on stderr, without keys."""
 
 
-class ModelBudgetSpent(Event, frozen=True, kw_only=True, tag="model_budget_spent"):
+class ModelBudgetSpent(FromChild, frozen=True, kw_only=True, tag="model_budget_spent"):
     """The relay for model calls has refused a request beyond the run's limits."""
 
     what: str
     """The limit, such as `5,000 requests`."""
 
 
-class Order(msgspec.Struct, frozen=True, kw_only=True, tag_field="do"):
+class ToChild(msgspec.Struct, frozen=True, kw_only=True, tag_field="do"):
     """Parent to child."""
 
 
-class CloseRun(Order, frozen=True, kw_only=True, tag="close"):
+class CloseGateway(ToChild, frozen=True, kw_only=True, tag="close"):
     """To a gateway: the agent is gone, and why."""
 
     reason: str
     agent: dict[str, Any] = {}
 
 
-class StartAgent(Order, frozen=True, kw_only=True, tag="start_agent"):
+class StartAgent(ToChild, frozen=True, kw_only=True, tag="start_agent"):
     """The first line to an agent supervisor."""
 
     agent: str
@@ -176,14 +176,14 @@ class StartAgent(Order, frozen=True, kw_only=True, tag="start_agent"):
     limits: AgentLimits = AgentLimits()
 
 
-class StartRelay(Order, frozen=True, kw_only=True, tag="start_relay"):
+class StartRelay(ToChild, frozen=True, kw_only=True, tag="start_relay"):
     """The first line to a relay for model calls."""
 
     order: dict[str, Any]
-    """`relay.service.Order`; it has the provider's key."""
+    """`relay.service.RelaySetup`; it has the provider's key."""
 
 
-class SubmitsSeen(Order, frozen=True, kw_only=True, tag="submits_seen"):
+class SubmitsSeen(ToChild, frozen=True, kw_only=True, tag="submits_seen"):
     """To an agent supervisor: the agent's submits so far."""
 
     asked: int
@@ -194,14 +194,14 @@ class SubmitsSeen(Order, frozen=True, kw_only=True, tag="submits_seen"):
     """Seconds that they have waited since the supervisor's start, which count against no limit of the agent."""
 
 
-class StopAgent(Order, frozen=True, kw_only=True, tag="stop_agent"):
+class StopAgent(ToChild, frozen=True, kw_only=True, tag="stop_agent"):
     """To an agent supervisor: end the agent and all that it has started."""
 
 
 AnyEvent = (
     Ready
     | Waits
-    | Progress
+    | TrainProgress
     | AgentTurn
     | AgentDoing
     | AgentUsed
@@ -209,7 +209,7 @@ AnyEvent = (
     | AgentEnded
     | ModelBudgetSpent
 )
-AnyOrder = CloseRun | StartAgent | StartRelay | SubmitsSeen | StopAgent
+AnyOrder = CloseGateway | StartAgent | StartRelay | SubmitsSeen | StopAgent
 _events: msgspec.json.Decoder[AnyEvent] = msgspec.json.Decoder(AnyEvent)
 _orders: msgspec.json.Decoder[AnyOrder] = msgspec.json.Decoder(AnyOrder)
 
@@ -219,7 +219,7 @@ MAX_LINE_BYTES = 1 << 20
 _MAX_TEXT = 2000
 
 
-def line(message: Event | Order) -> bytes:
+def line(message: FromChild | ToChild) -> bytes:
     """Encodes a message as one line of JSON, shortened if it is too long, which an agent's CLI may cause.
 
     `StartAgent` and `StartRelay`, with the operator's own settings, are never shortened.
@@ -246,7 +246,7 @@ def event_of(data: bytes) -> AnyEvent:
         raise ProtocolError(f"not an event of a child process: {data[:200]!r} ({error})") from error
 
 
-def emit(event: Event) -> None:
+def emit(event: FromChild) -> None:
     """Sends an event to the parent; dropped when the parent is gone."""
     with contextlib.suppress(BrokenPipeError):
         os.write(sys.stdout.fileno(), line(event))
@@ -302,7 +302,7 @@ class Child(ChildProcess):
             async with asyncio.timeout(grace_s):
                 await self.ended()
 
-    async def tell(self, order: Order) -> None:
+    async def tell(self, order: ToChild) -> None:
         """Sends an order; dropped when the child is gone."""
         stdin = self._process.stdin
         assert stdin is not None

@@ -44,7 +44,7 @@ class Resources:
         self._folders, self._skipped = folders, skipped
         quota = asked.cpus and max(1000, round(asked.cpus * _QUOTA_US))
         wanted = {"cpu": quota, "memory": asked.memory_bytes, "pids": asked.pids}
-        self._group = cgroups.Group({name: value for name, value in wanted.items() if value})
+        self._group = cgroups.ControlGroup({name: value for name, value in wanted.items() if value})
         self.joins = self._group.procs
         """Files into which a program of the agent writes its id before it starts."""
         held = self._group.held

@@ -22,7 +22,7 @@ from evopolicy_common.wire.http import serving
 from evopolicy_gateway.processes import child_messages
 from evopolicy_gateway.processes.child_messages import AgentDoing, ModelBudgetSpent, Orders, StartRelay
 from evopolicy_gateway.relay.limits import Used
-from evopolicy_gateway.relay.service import Order, Relay
+from evopolicy_gateway.relay.service import Relay, RelaySetup
 from evopolicy_gateway.relay.usage import Prices
 
 _PR_SET_DUMPABLE = 4
@@ -54,7 +54,7 @@ async def _main(fd: int) -> None:
     first = await orders.next()
     if not isinstance(first, StartRelay):
         return
-    order = msgspec.convert(first.order, Order)
+    order = msgspec.convert(first.order, RelaySetup)
 
     def counted(note: str = "") -> None:
         used = relay.used

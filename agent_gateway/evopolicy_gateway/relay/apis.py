@@ -119,7 +119,7 @@ def _chosen(headers: Mapping[str, str], names: tuple[str, ...], starts: tuple[st
     return {name: value for name, value in lower.items() if name in names or name.startswith(starts)}
 
 
-class Refusal(NamedTuple):
+class RelayRefusal(NamedTuple):
     """An error that the relay answers itself, in the words of each protocol."""
 
     status: int
@@ -142,16 +142,16 @@ class Refusal(NamedTuple):
 
 _WRONG = "invalid_request_error"
 _INVALID = (_WRONG, "invalid_request")
-SPENT = Refusal(
+SPENT = RelayRefusal(
     400, ("billing_limit_user_error", "billing_hard_limit_reached"), _WRONG, "FAILED_PRECONDITION"
 )
 """As OpenAI and Anthropic refuse an account without money: clients do not try again."""
-NO_TOKEN = Refusal(401, (_WRONG, "invalid_api_key"), "authentication_error", "UNAUTHENTICATED")
-OTHER_MODEL = Refusal(404, (_WRONG, "model_not_found"), "not_found_error", "NOT_FOUND")
-NO_PATH = Refusal(404, (_WRONG, "unknown_url"), "not_found_error", "NOT_FOUND")
-INVALID = Refusal(400, _INVALID, _WRONG, "INVALID_ARGUMENT")
-TOO_SLOW = Refusal(408, _INVALID, _WRONG, "DEADLINE_EXCEEDED")
-TOO_LARGE = Refusal(413, _INVALID, "request_too_large", "INVALID_ARGUMENT")
-COMPRESSED = Refusal(415, _INVALID, _WRONG, "INVALID_ARGUMENT")
-TOO_MANY = Refusal(429, ("requests", "rate_limit_exceeded"), "rate_limit_error", "RESOURCE_EXHAUSTED")
-UNREACHABLE = Refusal(502, ("server_error", "server_error"), "api_error", "UNAVAILABLE")
+NO_TOKEN = RelayRefusal(401, (_WRONG, "invalid_api_key"), "authentication_error", "UNAUTHENTICATED")
+OTHER_MODEL = RelayRefusal(404, (_WRONG, "model_not_found"), "not_found_error", "NOT_FOUND")
+NO_PATH = RelayRefusal(404, (_WRONG, "unknown_url"), "not_found_error", "NOT_FOUND")
+INVALID = RelayRefusal(400, _INVALID, _WRONG, "INVALID_ARGUMENT")
+TOO_SLOW = RelayRefusal(408, _INVALID, _WRONG, "DEADLINE_EXCEEDED")
+TOO_LARGE = RelayRefusal(413, _INVALID, "request_too_large", "INVALID_ARGUMENT")
+COMPRESSED = RelayRefusal(415, _INVALID, _WRONG, "INVALID_ARGUMENT")
+TOO_MANY = RelayRefusal(429, ("requests", "rate_limit_exceeded"), "rate_limit_error", "RESOURCE_EXHAUSTED")
+UNREACHABLE = RelayRefusal(502, ("server_error", "server_error"), "api_error", "UNAVAILABLE")

@@ -46,7 +46,7 @@ class ModelTerms(msgspec.Struct, frozen=True, kw_only=True):
     """Whether requests with tools that the provider runs are refused."""
 
 
-class Request(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
+class LoggedRequest(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
     """One line of the ledger: a request that went to the provider."""
 
     at: float
@@ -106,7 +106,7 @@ class Used(msgspec.Struct, kw_only=True):
     """Sum over the answered requests, seconds."""
     wait_s: float = 0.0
 
-    def count_request(self, request: Request, declared: str | None = None) -> None:
+    def count_request(self, request: LoggedRequest, declared: str | None = None) -> None:
         self.requests += 1
         self.usage += request.usage
         self.failed += not 200 <= request.status < 300 or request.broken
@@ -164,10 +164,10 @@ def _count(counts: dict[str, int], name: str) -> None:
         counts[name] = counts.get(name, 0) + 1
 
 
-_decoder = msgspec.json.Decoder(Request)
+_decoder = msgspec.json.Decoder(LoggedRequest)
 
 
-class Ledger:
+class RequestLog:
     """Appends requests, unbuffered: a line that is written survives the end of any process."""
 
     def __init__(self, path: Path, declared: str | None) -> None:
@@ -180,7 +180,7 @@ class Ledger:
     def close(self) -> None:
         self._file.close()
 
-    def write(self, request: Request) -> None:
+    def write(self, request: LoggedRequest) -> None:
         """Raises OSError when the disk refuses."""
         self.used.count_request(request, self._declared)
         self._file.write(msgspec.json.encode(request) + b"\n")

@@ -23,7 +23,15 @@ from msgspec.structs import replace
 
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.records import model_record
-from evopolicy_common.records.model_record import Call, Kept, Level, Pack, key_of, read_calls, request_of
+from evopolicy_common.records.model_record import (
+    Level,
+    Pack,
+    RecordedCall,
+    StoredRequest,
+    key_of,
+    read_calls,
+    request_of,
+)
 from evopolicy_common.records.secrets import Redaction
 from evopolicy_gateway.relay import apis
 from evopolicy_gateway.relay.canonical import canonical, difference
@@ -34,7 +42,7 @@ MAX_ANSWER_BYTES = 8 << 20
 _MAX_HEADERS, _MAX_HEADER = 30, 200
 
 
-class Source(Protocol):
+class CallSource(Protocol):
     """Where answers come from."""
 
     def sent(self, sent: Sent) -> contextlib.AbstractAsyncContextManager[Answer]: ...
@@ -63,12 +71,12 @@ class Cleaning:
         return data
 
 
-class Recorder:
+class CallRecorder:
     """A provider whose calls are recorded."""
 
     def __init__(
         self,
-        source: Source,
+        source: CallSource,
         folder: Path,
         level: Level,
         clean: Cleaning,
@@ -128,7 +136,9 @@ class Recorder:
         if self._n >= model_record.MAX_CALLS:
             raise ValueError(f"its limit of {model_record.MAX_CALLS:,} calls is reached")
         request = canonical(sent.name, self._clean(sent.body))
-        line = Call(n=n, api=sent.name, method=sent.method, digest=key_of(request), status=0, broken=True)
+        line = RecordedCall(
+            n=n, api=sent.name, method=sent.method, digest=key_of(request), status=0, broken=True
+        )
         if answer is not None:
             data = self._clean(bytes(answer.heard))
             passed = itertools.islice(apis.passed_down(answer.got.headers).items(), _MAX_HEADERS)
@@ -177,7 +187,7 @@ def document_of(request: bytes) -> dict[str, Any]:
 
 
 def _put_request(pack: Pack, request: bytes) -> str:
-    kept = Kept(plain={}, lists={})
+    kept = StoredRequest(plain={}, lists={})
     for name, value in document_of(request).items():
         if isinstance(value, list):
             kept.lists[name] = [pack.put(orjson.dumps(each)) for each in value]

@@ -28,7 +28,7 @@ _TIERS = ("servicetier", "speed")
 _MAX_NAMES, _SHOWN = 20, 200
 
 
-class Rules(msgspec.Struct, frozen=True, kw_only=True):
+class RequestRules(msgspec.Struct, frozen=True, kw_only=True):
     """What a request of an API may have."""
 
     fields: dict[str, Any]
@@ -54,8 +54,8 @@ def _template(about: Any) -> Any:
     return dict.fromkeys(about.get("_", "").split(), ANY) | nested
 
 
-def _rules(about: dict[str, Any]) -> Rules:
-    return Rules(
+def _rules(about: dict[str, Any]) -> RequestRules:
+    return RequestRules(
         fields=_template(about["fields"]),
         tools=_template(about["tools"]),
         hosted=_template(about.get("hosted", {})),
@@ -74,7 +74,7 @@ _HOSTED_FIELDS = (
 """Other fields that let the provider run tools; a stored prompt or cache may have some."""
 
 
-class Facts(msgspec.Struct, frozen=True, kw_only=True):
+class RequestFacts(msgspec.Struct, frozen=True, kw_only=True):
     """What the relay needs to know of a request."""
 
     body: bytes = b""
@@ -96,7 +96,7 @@ class Facts(msgspec.Struct, frozen=True, kw_only=True):
     """Most tokens of the output, of all answers together."""
 
 
-def facts(api: str, body: bytes, model: str | None) -> Facts:
+def facts(api: str, body: bytes, model: str | None) -> RequestFacts:
     """Reads a request. `model`: the one that its path names. Raises ValueError for what two readers could understand
     in two ways, and for what is too complex."""
     document = parsed(body)
@@ -112,7 +112,7 @@ def facts(api: str, body: bytes, model: str | None) -> Facts:
         with_counts = _with_counts(document) if api == "chat/completions" else None
     except TypeError as error:
         raise ValueError(f"the request cannot be sent on: {error}") from error
-    return Facts(
+    return RequestFacts(
         body=data,
         with_counts=with_counts,
         asked=(str(document.get("model", "")) if model is None else model)[:_SHOWN],
@@ -163,7 +163,7 @@ def _with_counts(document: dict[str, object]) -> bytes | None:
     return orjson.dumps(document | {"stream_options": options | {"include_usage": True}})
 
 
-def _tools(document: dict[str, object], rules: Rules) -> tuple[list[str], list[str]]:
+def _tools(document: dict[str, object], rules: RequestRules) -> tuple[list[str], list[str]]:
     """The kinds of tools that the provider runs, without the version of Anthropic's, and the places of unknown parts.
     An unknown kind counts as one of these."""
     hosted: list[str] = []
@@ -199,7 +199,7 @@ def _offered(document: dict[str, object]) -> Iterator[tuple[str, Any]]:
             yield place, tool
 
 
-def _kinds(tool: object, rules: Rules) -> list[tuple[str, dict[str, Any]]]:
+def _kinds(tool: object, rules: RequestRules) -> list[tuple[str, dict[str, Any]]]:
     """The kinds in a tool, each with its part: Google's may hold several."""
     if not isinstance(tool, dict):
         return []

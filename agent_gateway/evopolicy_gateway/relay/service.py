@@ -22,12 +22,12 @@ from evopolicy_common.records.model_record import Level
 from evopolicy_common.records.secrets import Redaction
 from evopolicy_gateway.relay import apis, limits, requests
 from evopolicy_gateway.relay.answers import FREE, SHAPES, AnswerReader
-from evopolicy_gateway.relay.apis import Refusal, Route, Upstream
-from evopolicy_gateway.relay.limits import Ledger
+from evopolicy_gateway.relay.apis import RelayRefusal, Route, Upstream
+from evopolicy_gateway.relay.limits import RequestLog
 from evopolicy_gateway.relay.provider import FAILED, NOT_SENT, Answer, Provider, Sent
 from evopolicy_gateway.relay.recording import MAX_ANSWER_BYTES as MAX_RECORDED_BYTES
-from evopolicy_gateway.relay.recording import Cleaning, Recorder, Replayed, Source
-from evopolicy_gateway.relay.requests import Facts
+from evopolicy_gateway.relay.recording import CallRecorder, CallSource, Cleaning, Replayed
+from evopolicy_gateway.relay.requests import RequestFacts
 from evopolicy_gateway.relay.usage import Usage
 
 MAX_REQUEST_BYTES = 32 << 20
@@ -51,7 +51,7 @@ _ADDED = (b"stream_options", b"include_usage")
 _BROKEN = (*FAILED, ValueError, zlib.error, MemoryError)
 
 
-class Order(limits.ModelTerms, frozen=True, kw_only=True):
+class RelaySetup(limits.ModelTerms, frozen=True, kw_only=True):
     """The first line on a relay process's stdin, JSON."""
 
     upstream: Upstream
@@ -74,7 +74,7 @@ class Order(limits.ModelTerms, frozen=True, kw_only=True):
 class _RefusedError(Exception):
     """The relay answers a request itself. Without headers the answer is final."""
 
-    def __init__(self, refusal: Refusal, message: str, headers: Mapping[str, str] = _FINAL) -> None:
+    def __init__(self, refusal: RelayRefusal, message: str, headers: Mapping[str, str] = _FINAL) -> None:
         super().__init__(message)
         self.refusal, self.headers = refusal, headers
 
@@ -88,7 +88,7 @@ class Relay:
 
     def __init__(
         self,
-        order: Order,
+        order: RelaySetup,
         *,
         counted: Callable[[], None],
         note: Callable[[str], None],
@@ -99,7 +99,7 @@ class Relay:
         limit that is used up. `now`: Unix time, seconds."""
         self.order = order
         self.upstream = order.upstream
-        self._ledger = Ledger(Path(order.ledger), order.model)
+        self._ledger = RequestLog(Path(order.ledger), order.model)
         self.used = self._ledger.used
         self._counted, self._note, self._spent = counted, note, spent
         self.now = now
@@ -114,13 +114,13 @@ class Relay:
         keys = order.upstream.key, *order.upstream.headers.values()
         self.clean = Redaction(keys).without_known
         clean, folder = Cleaning(order.tokens, (*order.secrets, *keys)), Path(order.folder)
-        self.provider: Source
+        self.provider: CallSource
         if order.replay:
             self.provider = Replayed(Path(order.replay), clean, folder, spent)
         else:
             self.provider = Provider(order.upstream.base_url, order.timeout_s)
         if order.record != "off":
-            self.provider = Recorder(self.provider, folder, order.record, clean, note)
+            self.provider = CallRecorder(self.provider, folder, order.record, clean, note)
 
     async def close(self, grace_s: float = 0.0) -> None:
         """Ends the answers that are still coming after `grace_s`; they are counted as broken off."""
@@ -179,10 +179,10 @@ class Relay:
             raise _RefusedError(apis.COMPRESSED, "send the request uncompressed")
         return route
 
-    async def _facts(self, exchange: _Exchange, request: Request, route: Route) -> Facts:
+    async def _facts(self, exchange: _Exchange, request: Request, route: Route) -> RequestFacts:
         """What the request asks for. Raises _RefusedError."""
         if request.method == "GET":
-            return Facts()
+            return RequestFacts()
         try:
             async with asyncio.timeout(REQUEST_WAIT_S):
                 body = await exchange.whole(request.stream(), "request", MAX_REQUEST_BYTES)
@@ -197,7 +197,7 @@ class Relay:
         except ValueError as error:
             raise _RefusedError(apis.INVALID, f"the request cannot be read: {error}") from None
 
-    def _admit(self, exchange: _Exchange, route: Route, facts: Facts) -> None:
+    def _admit(self, exchange: _Exchange, route: Route, facts: RequestFacts) -> None:
         """Raises _RefusedError for a request that the run's terms or limits do not allow."""
         order, used = self.order, self.used
         if facts.body:
@@ -220,7 +220,7 @@ class Relay:
                 raise _busy(f"with the requests under way this one may exceed the limit of {what}")
         exchange.reserve = own
 
-    def _check(self, facts: Facts) -> None:
+    def _check(self, facts: RequestFacts) -> None:
         """Raises _RefusedError for a request that the run's terms do not allow."""
         order = self.order
         if facts.background:
@@ -251,7 +251,7 @@ class Relay:
         body = why.refusal.body(self.upstream.protocol, str(why))
         return Response(self.clean(body), why.refusal.status, headers)
 
-    def count(self, line: limits.Request, reserve: limits.Reserve) -> None:
+    def count(self, line: limits.LoggedRequest, reserve: limits.Reserve) -> None:
         """Writes a finished request to the ledger. Raises OSError when the disk refuses."""
         if line.usage.total > max(reserve.usage.total, self._least.total):
             self._least = line.usage
@@ -311,7 +311,7 @@ class _Exchange:
             self.hold(before + len(data))
         return bytes(data)
 
-    async def begin(self, request: Request, route: Route, facts: Facts) -> Response:
+    async def begin(self, request: Request, route: Route, facts: RequestFacts) -> Response:
         """Sends the request, and returns the answer, whose bytes are still to come."""
         relay = self._relay
         headers = apis.passed_up(request.headers) | relay.upstream.authorization()
@@ -319,7 +319,7 @@ class _Exchange:
         counts = facts.with_counts if relay.adds_counts else None
         bodies = [facts.body] if counts is None else [counts, facts.body]
         self._facts, self._route, self._base = facts, route, sum(map(len, bodies))
-        self._line = limits.Request(
+        self._line = limits.LoggedRequest(
             at=round(relay.now(), 3), api=route.api, asked=facts.asked, hosted_tools=facts.hosted, status=0
         )
         sent = [Sent(route.name, request.method, url, headers, body) for body in bodies]

@@ -17,9 +17,9 @@ from evopolicy_common.processes.notices import Waiting
 from evopolicy_common.records.secrets import without_keys
 from evopolicy_common.records.words import in_words
 from evopolicy_gateway.processes import child_messages as messages
-from evopolicy_gateway.processes.child_messages import Progress
+from evopolicy_gateway.processes.child_messages import TrainProgress
 from evopolicy_gateway.run import model_relay, record
-from evopolicy_gateway.run.children import GatewayProcess, OpenRun, SupervisedAgent
+from evopolicy_gateway.run.children import GatewayProcess, RunContext, SupervisedAgent
 from evopolicy_gateway.run.times import Times
 from evopolicy_gateway.workspace.agents_md import LAST_WORDS_S
 
@@ -30,7 +30,7 @@ END_GRACE_S = 15.0
 class AgentSide:
     """Plays once."""
 
-    def __init__(self, run: OpenRun, *, closed: bool) -> None:
+    def __init__(self, run: RunContext, *, closed: bool) -> None:
         """`closed`: the coordinator has closed the run, so that the agent has ended."""
         self._run = run
         self._spent = asyncio.Event()
@@ -129,7 +129,7 @@ class AgentSide:
                 self.cancelled = True
                 self._spent.set()
 
-    async def _on_progress(self, progress: Progress) -> None:
+    async def _on_progress(self, progress: TrainProgress) -> None:
         stopwatch = self._run.stopwatch
         times = Times(in_flight_s=progress.in_flight_s, feedback_s=progress.feedback_s)
         stopwatch.reported("gateway", times)
@@ -163,4 +163,4 @@ class AgentSide:
         except Exception as error:  # the agent has ended: no bug in this costs the run
             why = record.why_failed(error, run.folder.harness_log)
             run.note(f"the coordinator does not commit to this side of run.json: {why}")
-        await self._gateway.close(messages.CloseRun(reason=reason, agent=about))
+        await self._gateway.close(messages.CloseGateway(reason=reason, agent=about))

@@ -19,23 +19,23 @@ from evopolicy_common.wire import credentials
 from evopolicy_common.wire.credentials import Credentials
 from evopolicy_gateway.jail.jail import JailOrder
 from evopolicy_gateway.processes import child_messages as messages
-from evopolicy_gateway.processes.child_messages import AgentEnded, Child, Progress, Ready, RelayAddress
+from evopolicy_gateway.processes.child_messages import AgentEnded, Child, Ready, RelayAddress, TrainProgress
 from evopolicy_gateway.relay.limits import read_ledger
 from evopolicy_gateway.run.operations import Operations
 from evopolicy_gateway.run.plan import Plan
 from evopolicy_gateway.run.times import Stopwatch, Times
-from evopolicy_gateway.run.watch import View
+from evopolicy_gateway.run.watch import RunsView
 from evopolicy_gateway.run_folder.layout import RunFolder
 from evopolicy_gateway.run_folder.listener import TOKEN_VARIABLE, place_notice
 from evopolicy_gateway.workspace import staging as workspace
 
 
-class OpenRun(msgspec.Struct, frozen=True, kw_only=True):
+class RunContext(msgspec.Struct, frozen=True, kw_only=True):
     plan: Plan
     run: str
     """Its id at the cluster."""
     stopwatch: Stopwatch
-    watch: View
+    watch: RunsView
     operations: Operations
     gateway: Credentials
     """Of the gateway's role; the jail hides their files."""
@@ -55,14 +55,14 @@ _MAX_QUICK_DEATHS = 5
 _USAGE_ERROR = 2
 
 
-class Kept:
+class RestartedChild:
     """A part of an open run, over all its processes, of which one is alive at a time."""
 
-    def __init__(self, run: OpenRun) -> None:
+    def __init__(self, run: RunContext) -> None:
         self._run = run
         self._child: Child | None = None
 
-    async def tell(self, order: messages.Order) -> None:
+    async def tell(self, order: messages.ToChild) -> None:
         """Sends an order to the present process, if there is one."""
         if self._child is not None:
             await self._child.tell(order)
@@ -78,13 +78,13 @@ class Kept:
         return self._child
 
 
-class GatewayProcess(Kept):
-    def __init__(self, run: OpenRun, on_progress: Callable[[Progress], Awaitable[None]]) -> None:
+class GatewayProcess(RestartedChild):
+    def __init__(self, run: RunContext, on_progress: Callable[[TrainProgress], Awaitable[None]]) -> None:
         super().__init__(run)
         self._on_progress = on_progress
         self.closed = False
         """Whether the coordinator has closed the run."""
-        self._close: messages.CloseRun | None = None
+        self._close: messages.CloseGateway | None = None
 
     @property
     def is_closing(self) -> bool:
@@ -112,7 +112,7 @@ class GatewayProcess(Kept):
             run.note(f"the gateway ended with status {code}; starting it again")
             await asyncio.sleep(0.1 * 2**quick_deaths)
 
-    async def close(self, order: messages.CloseRun) -> None:
+    async def close(self, order: messages.CloseGateway) -> None:
         self._close = order
         await self.tell(order)
 
@@ -129,11 +129,11 @@ class GatewayProcess(Kept):
                     run.served.set_result(event)
                 if self._close is not None:
                     await self.close(self._close)
-            case Progress():
+            case TrainProgress():
                 await self._on_progress(event)
 
 
-def _place_notes(run: OpenRun, ready: Ready) -> list[str]:
+def _place_notes(run: RunContext, ready: Ready) -> list[str]:
     """Facts about the agent's place: for a remote agent, those that the operator passes on to it."""
     if run.plan.listener is None:
         until = "until then no hidden case that this run shares is played while its agent lives"
@@ -153,10 +153,10 @@ _ENDLESS = 1 << 62
 """Bytes that a remote agent's workspace may take: its files may be elsewhere, and are its operator's."""
 
 
-class SupervisedAgent(Kept):
+class SupervisedAgent(RestartedChild):
     """The agent of one run below its supervisor."""
 
-    def __init__(self, run: OpenRun) -> None:
+    def __init__(self, run: RunContext) -> None:
         super().__init__(run)
         self._terms = run.plan.harness().model
         self.survivors: list[int] = []

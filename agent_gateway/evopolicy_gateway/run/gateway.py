@@ -28,7 +28,7 @@ from evopolicy_common.wire import credentials, transport
 from evopolicy_common.wire.http import serving
 from evopolicy_gateway.http.server import bind
 from evopolicy_gateway.http.service import make_app
-from evopolicy_gateway.processes.child_messages import CloseRun
+from evopolicy_gateway.processes.child_messages import CloseGateway
 from evopolicy_gateway.run_folder.journal import Journal
 from evopolicy_gateway.run_folder.layout import RunFolder, save, saved
 from evopolicy_gateway.run_folder.listener import AgentPlace, agent_place, ends_unseen
@@ -61,10 +61,10 @@ class Gateway:
         """Set to leave the run open."""
         self.permit_s = 0.0
         """Seconds spent waiting for the agent's permit."""
-        self._orders: asyncio.Future[CloseRun | None] = asyncio.get_running_loop().create_future()
+        self._orders: asyncio.Future[CloseGateway | None] = asyncio.get_running_loop().create_future()
         self._changed = asyncio.Event()
 
-    def tell(self, close: CloseRun | None) -> None:
+    def tell(self, close: CloseGateway | None) -> None:
         """Ends the gateway: closes the run, or with None leaves it open, even while the closing waits."""
         if close is None:
             self._stopped.set()
@@ -76,7 +76,7 @@ class Gateway:
         folder = self._folder
         (own, run), place = _load(folder), agent_place(folder)
         if folder.closing.exists():
-            self.tell(saved(folder.closing, CloseRun))
+            self.tell(saved(folder.closing, CloseGateway))
         async with contextlib.AsyncExitStack() as stack:
             sock, address = await bind(folder)
             stack.callback(sock.close)
@@ -121,7 +121,7 @@ class Gateway:
             self._on_wait("")
         return not self._stopped.is_set() if granted is None else granted
 
-    async def _watch(self, pipeline: SubmitPipeline, http: asyncio.Task[None]) -> CloseRun | None:
+    async def _watch(self, pipeline: SubmitPipeline, http: asyncio.Task[None]) -> CloseGateway | None:
         """Reports changes until `tell`; returns its argument."""
         ends: list[asyncio.Future[Any]] = [self._orders, pipeline.fatal, http]
         machine = pipeline.machine
@@ -144,7 +144,7 @@ class Gateway:
             await asyncio.wait([over, *ends], timeout=_REPORT_S, return_when=asyncio.FIRST_COMPLETED)
             over.cancel()
 
-    async def _close(self, pipeline: SubmitPipeline, close: CloseRun) -> bool:
+    async def _close(self, pipeline: SubmitPipeline, close: CloseGateway) -> bool:
         await asyncio.to_thread(save, self._folder.closing, close)
         # The agent is gone, but its last submit is still played and written.
         pipeline.machine.close()

@@ -45,11 +45,11 @@ from evopolicy_gateway.http.server import Address
 from evopolicy_gateway.processes.child_messages import Ready
 from evopolicy_gateway.run import record
 from evopolicy_gateway.run.agent_side import AgentSide
-from evopolicy_gateway.run.children import OpenRun
+from evopolicy_gateway.run.children import RunContext
 from evopolicy_gateway.run.operations import Operations
 from evopolicy_gateway.run.plan import Plan, find_start, stage_start
 from evopolicy_gateway.run.times import Stopwatch
-from evopolicy_gateway.run.watch import View
+from evopolicy_gateway.run.watch import RunsView
 from evopolicy_gateway.run_folder.layout import save, saved
 from evopolicy_gateway.run_folder.listener import agent_place
 from evopolicy_gateway.run_folder.locks import alone
@@ -68,7 +68,7 @@ class RunLifecycle:
         plan: Plan,
         operations: Operations,
         gateway: Credentials,
-        watch: View,
+        watch: RunsView,
         leaves: Leaves = "nothing",
         on_agent_gone: Callable[[], None] = lambda: None,
     ) -> None:
@@ -224,7 +224,7 @@ class RunLifecycle:
             self._note(f"run {self.run} in {folder.root}")
         self._operations.watched_by(self.run, (folder.lock, folder.supervisor_lock))
         self._stopwatch = Stopwatch(folder.times)
-        opened = OpenRun(
+        opened = RunContext(
             plan=self._plan,
             run=self.run,
             stopwatch=self._stopwatch,

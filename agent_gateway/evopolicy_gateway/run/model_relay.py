@@ -39,9 +39,9 @@ from evopolicy_gateway.processes.child_messages import (
     StartRelay,
 )
 from evopolicy_gateway.relay.limits import read_ledger
-from evopolicy_gateway.relay.service import Order
+from evopolicy_gateway.relay.service import RelaySetup
 from evopolicy_gateway.run import recorded_agent
-from evopolicy_gateway.run.children import Kept, OpenRun
+from evopolicy_gateway.run.children import RestartedChild, RunContext
 from evopolicy_gateway.run.plan import Replays
 from evopolicy_gateway.run_folder.layout import saved
 from evopolicy_gateway.workspace import staging as workspace
@@ -50,10 +50,12 @@ _MAX_DEATHS = 20
 _PAUSE_S = 0.2
 
 
-class ModelRelay(Kept):
+class ModelRelay(RestartedChild):
     """The relay of one run, from `serve` to `end`."""
 
-    def __init__(self, run: OpenRun, order: Order, sock: socket.socket, spent: Callable[[str], None]) -> None:
+    def __init__(
+        self, run: RunContext, order: RelaySetup, sock: socket.socket, spent: Callable[[str], None]
+    ) -> None:
         """`sock`: bound to the relay's address. `spent` gets the limit beyond which it has refused a request."""
         super().__init__(run)
         self._sock, self._spent = sock, spent
@@ -105,7 +107,7 @@ def use_words(tokens: Mapping[str, object]) -> str:
     return f"tokens: {kinds}; {price}"
 
 
-def of_run(run: OpenRun, ready: Ready, model_spent: asyncio.Event) -> ModelRelay | None:
+def of_run(run: RunContext, ready: Ready, model_spent: asyncio.Event) -> ModelRelay | None:
     """The relay for the agent's model, None without one. It sets `model_spent` when it refuses a request."""
     plan, folder, replays = run.plan, run.folder, run.plan.replays
     terms = plan.harness().model
@@ -124,7 +126,7 @@ def of_run(run: OpenRun, ready: Ready, model_spent: asyncio.Event) -> ModelRelay
             run.note(f"the model budget is spent: {what}" if replays is None else f"the replay ends: {what}")
         model_spent.set()
 
-    order = Order(
+    order = RelaySetup(
         **msgspec.structs.asdict(terms),
         token=token,
         ledger=str(folder.model_requests),
@@ -151,7 +153,7 @@ def of_run(run: OpenRun, ready: Ready, model_spent: asyncio.Event) -> ModelRelay
     return made
 
 
-def _secrets(run: OpenRun, ready: Ready) -> tuple[str, ...]:
+def _secrets(run: RunContext, ready: Ready) -> tuple[str, ...]:
     """Texts that the record of model calls leaves out, as the agent's log does."""
     plan, harness, config = run.plan, run.plan.harness(), run.plan.known_config
     variables = environment_of({**ready.variables, **workspace.variables(run.folder)})

@@ -32,7 +32,7 @@ from evopolicy_common.records import run_record as schema
 from evopolicy_common.records.account import Claims
 from evopolicy_common.records.blobs import BlobStore, digest_of, write_atomically
 from evopolicy_common.records.code_metrics import CodeMetrics
-from evopolicy_common.records.open_run import Rejected, Requested
+from evopolicy_common.records.open_run import Rejected, SubmitRequested
 from evopolicy_common.records.policies import bundles, checkpoints
 from evopolicy_common.records.policies.bundles import Bundle
 from evopolicy_common.records.policies.checkpoints import CheckpointMeta
@@ -281,7 +281,7 @@ def _from_journal(folder: RunFolder) -> tuple[list[schema.RejectedSubmit], dict[
     rejected: list[schema.RejectedSubmit] = []
     kept: dict[int, str | None] = {}
     for entry in entries:
-        if isinstance(entry, Requested):
+        if isinstance(entry, SubmitRequested):
             requested = entry
         elif isinstance(entry, gateway.SubmitAccepted):
             kept[entry.submit_index] = requested.kept

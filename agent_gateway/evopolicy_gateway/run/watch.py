@@ -22,7 +22,7 @@ from evopolicy_common.messages.operator import RunProgress
 from evopolicy_common.records.suite_folder import SweepRun
 from evopolicy_common.records.words import in_words
 from evopolicy_common.terminal import harmless
-from evopolicy_gateway.processes.child_messages import AgentDoing, Progress
+from evopolicy_gateway.processes.child_messages import AgentDoing, TrainProgress
 
 PHASES = {
     "open": "train",
@@ -36,10 +36,10 @@ PHASES = {
 _BAR_WIDTH = 12
 
 
-class Row(msgspec.Struct):
+class RunLine(msgspec.Struct):
     """The known state of one run."""
 
-    progress: Progress | None = None
+    progress: TrainProgress | None = None
     phase: RunProgress | None = None
     action: str = ""
     held: str = ""
@@ -51,7 +51,7 @@ class Row(msgspec.Struct):
     entry: SweepRun | None = None
 
 
-class View(ABC):
+class RunsView(ABC):
     """Receives the reports of runs, by their short names, and shows a row for each."""
 
     no_news: tuple[str, ...] = ("",)
@@ -61,7 +61,7 @@ class View(ABC):
 
     def __init__(self, console: Terminal | None) -> None:
         """`console` None: prints nothing."""
-        self.rows: dict[str, Row] = {}
+        self.rows: dict[str, RunLine] = {}
         self._console = console
         self._drawn = console is not None and console.is_terminal
         self._last: dict[tuple[str, str], object] = {}
@@ -100,7 +100,7 @@ class View(ABC):
         self.row(run)
         self.event("note", run, text=text)
 
-    def progress(self, run: str, progress: Progress) -> None:
+    def progress(self, run: str, progress: TrainProgress) -> None:
         self.row(run).progress = progress
         last = progress.last_submit_id
         if last is not None and self.is_new(run, "submit", last):
@@ -140,8 +140,8 @@ class View(ABC):
         if what not in self.no_news and self.is_new(run, f"waits for {what}", True):
             self.event(kind, run, what=what)
 
-    def row(self, run: str) -> Row:
-        return self.rows.setdefault(run, Row())
+    def row(self, run: str) -> RunLine:
+        return self.rows.setdefault(run, RunLine())
 
     def is_new(self, run: str, kind: str, value: object) -> bool:
         """Whether the last value of that kind for the run differs from `value`."""
@@ -153,7 +153,7 @@ class View(ABC):
             self._console.print(text, soft_wrap=True)
 
 
-class RunView(View):
+class RunView(RunsView):
     """The view of `evopolicy run` and `evopolicy local`."""
 
     above = ("note", "held", "submit")
@@ -179,7 +179,7 @@ class RunView(View):
         return table
 
 
-def _cells(row: Row) -> tuple[str, ...]:
+def _cells(row: RunLine) -> tuple[str, ...]:
     progress = row.progress
     if progress is None:
         return ("", "", "", f"waiting for {row.held}" if row.held else "starting")
@@ -194,7 +194,7 @@ def _cells(row: Row) -> tuple[str, ...]:
     )
 
 
-def _now(row: Row, progress: Progress) -> str:
+def _now(row: RunLine, progress: TrainProgress) -> str:
     if row.held:
         return f"waiting for {row.held}"
     if row.phase is not None:

@@ -21,8 +21,8 @@ from evopolicy_common.errors import RefusedError, RequestError, StorageError
 from evopolicy_common.logs import log
 from evopolicy_common.messages.gateway import RunOpened, Submit, SubmitAccepted, SubmitDone
 from evopolicy_common.records.blobs import BlobStore
-from evopolicy_common.records.open_run import AnyLine, Died, Requested, Settled
-from evopolicy_common.records.policies.trees import Recorder
+from evopolicy_common.records.open_run import AnyLine, Died, Settled, SubmitRequested
+from evopolicy_common.records.policies.trees import TreeRecorder
 from evopolicy_common.refusals import RUN_LOST, Refusal
 from evopolicy_gateway.run_folder.journal import Journal
 from evopolicy_gateway.run_folder.layout import RunFolder
@@ -67,7 +67,7 @@ class SubmitPipeline:
         self._journal = journal
         self._blobs = BlobStore(folder.blobs)
         self._on_change = on_change
-        self._trees = Recorder(folder.workspace, folder.trees, started=folder.start.exists())
+        self._trees = TreeRecorder(folder.workspace, folder.trees, started=folder.start.exists())
         self._news = asyncio.Event()
         """Set, and replaced, at the next change of the machine."""
         self._uploaded: str | None = None
@@ -197,7 +197,7 @@ class SubmitPipeline:
             log.error("submit failed", submit=ticket.submit_id, exc_info=error)
             return machine.failed(error)
 
-    def _snapshot(self, submit: str) -> snapshots.Snapshot:
+    def _snapshot(self, submit: str) -> snapshots.SystemSnapshot:
         published = self.machine.run.profile != "own"
         snapshot = snapshots.take_snapshot(self.folder.system, self._blobs, published=published)
         return snapshots.record_tree(snapshot, submit, self._trees, self.folder.root)
@@ -226,7 +226,7 @@ class SubmitPipeline:
         for ticket in accepted[max(0, known - 1) :]:
             assert ticket.requested_at is not None
             request = self._journal.read_line(ticket.requested_at)
-            assert isinstance(request, Requested)
+            assert isinstance(request, SubmitRequested)
             await self._send(request.submit, ticket.index)
             await self._client.ended(ticket.index)
 

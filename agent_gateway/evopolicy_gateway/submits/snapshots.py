@@ -14,13 +14,13 @@ from evopolicy_common.messages.episode import FailureCategory, PolicyFailure
 from evopolicy_common.records.blobs import BlobStore
 from evopolicy_common.records.code_metrics import MAX_PARSED_BYTES, parse
 from evopolicy_common.records.policies import bundles
-from evopolicy_common.records.policies.trees import Recorder
+from evopolicy_common.records.policies.trees import TreeRecorder
 from evopolicy_common.records.secrets import read_passed
 
 POLICY_FILE = "policy.py"
 
 
-class Snapshot(msgspec.Struct, frozen=True, kw_only=True):
+class SystemSnapshot(msgspec.Struct, frozen=True, kw_only=True):
     """Exactly one of `digest` and `error` is set."""
 
     digest: str | None
@@ -33,7 +33,7 @@ class Snapshot(msgspec.Struct, frozen=True, kw_only=True):
     """Digest of the workspace's tree; empty: not recorded."""
 
 
-def take_snapshot(system: Path, blobs: BlobStore, *, published: bool = False) -> Snapshot:
+def take_snapshot(system: Path, blobs: BlobStore, *, published: bool = False) -> SystemSnapshot:
     """Snapshots the current `system` and stores the bundle.
 
     A folder that cannot be a bundle is the policy's failure and is charged: `missing_policy` when `policy.py` is
@@ -43,10 +43,10 @@ def take_snapshot(system: Path, blobs: BlobStore, *, published: bool = False) ->
     try:
         bundle = bundles.snapshot(system)
     except BundleError as error:
-        return Snapshot(digest=None, error=_no_bundle(system, str(error)))
+        return SystemSnapshot(digest=None, error=_no_bundle(system, str(error)))
     except OSError as error:
         why = f"system/ cannot be read: {error.strerror or error}"
-        return Snapshot(digest=None, error=_no_bundle(system, why))
+        return SystemSnapshot(digest=None, error=_no_bundle(system, why))
     files, failure = {file.path: file.data for file in bundle.files}, None
     if POLICY_FILE not in files:
         failure = _no_bundle(system, "system/policy.py is missing; write a class Policy there")
@@ -54,10 +54,12 @@ def take_snapshot(system: Path, blobs: BlobStore, *, published: bool = False) ->
         failure = _fault_of_source(files)
     digest = blobs.put(bundle.packed)
     sent, kept = (None, digest) if failure else (digest, None)
-    return Snapshot(digest=sent, error=failure, kept=kept, bundle=bundle)
+    return SystemSnapshot(digest=sent, error=failure, kept=kept, bundle=bundle)
 
 
-def record_tree(snapshot: Snapshot, submit: str, recorder: Recorder, folder: Path) -> Snapshot:
+def record_tree(
+    snapshot: SystemSnapshot, submit: str, recorder: TreeRecorder, folder: Path
+) -> SystemSnapshot:
     """The snapshot with the workspace's tree, unless that cannot be recorded. `folder`: the run's."""
     try:
         tree = recorder.record(submit, snapshot.bundle, read_passed(folder))

@@ -6,14 +6,14 @@
 
 The pipeline performs one effect at a time and passes its outcome to the method that returns the next effect:
 
-| the ticket in flight | effect         | outcome                                                                     |
-|----------------------|----------------|-----------------------------------------------------------------------------|
-| is new               | `TakeSnapshot` | `snapshotted`: `Note` of the entry `Requested`                              |
-| is journalled        | `Send`         | `sent`: `Note` of `SubmitAccepted`; `refused`: `Note` of `Refused`, its end |
-| is accepted          | `Collect`      | `collected`: `Note` of `Settled`, its end                                   |
-| has an entry         | `Note`         | `noted`: the effect that its next state needs                               |
-| met an error         | `Note`, `Died` | `noted`: `Stop`, which ends the process. If that happens to the next gateway |
-|                      |                | too: `Note` of `Refused`, its end                                           |
+| ticket        | effect         | outcome                                                                           |
+|---------------|----------------|-----------------------------------------------------------------------------------|
+| is new        | `TakeSnapshot` | `snapshotted`: `Note` of the entry `SubmitRequested`                              |
+| is journalled | `Send`         | `sent`: `Note` of `SubmitAccepted`; `refused`: `Note` of `SubmitRefused`, its end |
+| is accepted   | `Collect`      | `collected`: `Note` of `Settled`, its end                                         |
+| has an entry  | `Note`         | `noted`: the effect that its next state needs                                     |
+| met an error  | `Note`, `Died` | `noted`: `Stop`, which ends the process. If that happens to the next gateway      |
+|               |                | too: `Note` of `SubmitRefused`, its end                                           |
 
 State that survives the process changes in `noted` alone, when its entry is durable.
 """
@@ -31,12 +31,12 @@ from evopolicy_common.messages import gateway as messages
 from evopolicy_common.messages.gateway import CANCELLED, RunOpened, RunState, SubmitAccepted
 from evopolicy_common.records import open_run
 from evopolicy_common.records.blobs import digest_of
-from evopolicy_common.records.open_run import AnyLine, Requested
+from evopolicy_common.records.open_run import AnyLine, SubmitRequested
 from evopolicy_common.records.run_record import RejectedStatus, RejectedSubmit
 from evopolicy_common.records.summary import utc_text
 from evopolicy_common.refusals import RUN_OVER, WRONG_REQUEST, Refusal
 from evopolicy_gateway.run_folder.layout import submit_id
-from evopolicy_gateway.submits.snapshots import Snapshot
+from evopolicy_gateway.submits.snapshots import SystemSnapshot
 from evopolicy_gateway.submits.submit_request import Bounds, parse
 
 MAX_REJECTED_KEPT = 1000
@@ -58,7 +58,7 @@ class ConflictError(RequestError):
 class Ticket(msgspec.Struct, kw_only=True, eq=False):
     """The state of a submit that passed the checks."""
 
-    request: Requested
+    request: SubmitRequested
     requested_at: int | None = None
     """Offset of the journal's entry with `request` and its snapshot; None before it is there."""
     index: int
@@ -202,14 +202,14 @@ class TicketMachine:
             remaining_budget=self.state.remaining_budget,
         )
         return self._begin(
-            Requested(
+            SubmitRequested(
                 submit=messages.Submit(key=key, env_instances=parse(body, bounds), bundle=None),
                 client_key=client_key,
                 body_digest=digest_of(body),
             )
         )
 
-    def _begin(self, request: Requested) -> Ticket:
+    def _begin(self, request: SubmitRequested) -> Ticket:
         index, n = len(self.tickets), len(request.submit.env_instances)
         name = submit_id(index, self.run.episode_budget)
         self.in_flight = Ticket(request=request, index=index, submit_id=name, n_episodes=n)
@@ -243,7 +243,7 @@ class TicketMachine:
             return TakeSnapshot()
         return Send() if self.in_flight.accepted is None else Collect()
 
-    def snapshotted(self, snapshot: Snapshot) -> Note:
+    def snapshotted(self, snapshot: SystemSnapshot) -> Note:
         request = self._open.request
         why, tree = snapshot.error, snapshot.tree
         submit = msgspec.structs.replace(request.submit, bundle=snapshot.digest, bundle_error=why, tree=tree)
@@ -272,7 +272,9 @@ class TicketMachine:
         if over:
             self.close(cancelled=error.status == Refusal.RUN_CANCELLED)
         if self._open.accepted is None and (over or error.status in WRONG_REQUEST):
-            return Note(open_run.Refused(key=request.submit.key, status=error.status, message=error.message))
+            return Note(
+                open_run.SubmitRefused(key=request.submit.key, status=error.status, message=error.message)
+            )
         if not over:
             return self.failed(error)
         # Without an entry: if the coordinator opens the run once more, the next gateway collects the results.
@@ -288,7 +290,7 @@ class TicketMachine:
     def noted(self, entry: AnyLine, place: int) -> Effect | None:
         """The entry is durable at that offset of the journal; returns the next effect."""
         match entry:
-            case Requested():
+            case SubmitRequested():
                 ticket = self.in_flight or self._begin(entry)
                 ticket.request, ticket.requested_at = entry, place
             case SubmitAccepted():
@@ -299,7 +301,7 @@ class TicketMachine:
                 self.state = RunState(remaining_budget=remaining, n_submits=n, is_finalized=over)
             case open_run.Settled():
                 self._settle(self._open, entry, place)
-            case open_run.Refused():
+            case open_run.SubmitRefused():
                 over = entry.status in RUN_OVER
                 self._end(self._refusal() if over else RequestError(entry.status, entry.message))
             case open_run.Died():
@@ -327,7 +329,9 @@ class TicketMachine:
             return Stop(failure)
         charged = "it was not accepted" if ticket.accepted is None else "its episodes are charged and count"
         text = f"the gateway failed {MAX_DEATHS} times on this submit and gives it no feedback; {charged}"
-        return Note(open_run.Refused(key=ticket.request.submit.key, status="gateway_failed", message=text))
+        return Note(
+            open_run.SubmitRefused(key=ticket.request.submit.key, status="gateway_failed", message=text)
+        )
 
     def _end(self, error: RequestError | None) -> None:
         """Ends the ticket in flight. Without acceptance it takes no index."""

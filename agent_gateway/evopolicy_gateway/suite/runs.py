@@ -16,7 +16,7 @@ from evopolicy_common.records.run_record import Outcome, RunRecord
 from evopolicy_common.records.suite_folder import Index, SweepRun
 from evopolicy_common.records.words import in_words
 from evopolicy_common.terminal import number
-from evopolicy_gateway.operator.cluster import Cluster, connected
+from evopolicy_gateway.operator.cluster import ChosenCluster, connected
 from evopolicy_gateway.run.plan import Plan
 from evopolicy_gateway.run.watch import RunView
 from evopolicy_gateway.suite.decisions import Decision
@@ -57,7 +57,9 @@ class _Runs(Sweep):
         return why
 
 
-async def play_plans(plans: Sequence[Plan], where: Cluster, parallel: int, console: Terminal) -> PlayedRuns:
+async def play_plans(
+    plans: Sequence[Plan], where: ChosenCluster, parallel: int, console: Terminal
+) -> PlayedRuns:
     """Plays all plans, `parallel` agents at once; a failed run does not stop the others.
 
     Raises ConfigError when an option is wrong for every run.

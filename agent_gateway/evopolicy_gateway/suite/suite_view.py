@@ -21,7 +21,7 @@ from evopolicy_common.records.words import in_words
 from evopolicy_common.terminal import duration, number, say_json, short
 from evopolicy_gateway.processes.child_messages import AgentDoing
 from evopolicy_gateway.relay.usage import tokens_in
-from evopolicy_gateway.run.watch import PHASES, Row, View
+from evopolicy_gateway.run.watch import PHASES, RunLine, RunsView
 
 _SHOWN_ROWS = 24
 _WIDTHS = {"budget": 7, "submits": 7, "best mean": 9, "tokens": 6, "state": 30, "last action": 11}
@@ -34,7 +34,7 @@ _STYLES = ("bold", "red", "dim", "dim", "")
 """Styles of rows by `_order`: running, failed, on another host, waiting, ended."""
 
 
-class SuiteView(View):
+class SuiteView(RunsView):
     """The view of a sweep's runs: a table with the running ones and the last ended ones."""
 
     no_news = ("", FREE_SLOT)
@@ -42,7 +42,7 @@ class SuiteView(View):
 
     def __init__(self, names: list[str], parallel: int, console: Terminal | None = None) -> None:
         super().__init__(console)
-        self.rows = {name: Row() for name in names}
+        self.rows = {name: RunLine() for name in names}
         self.on_doing: Callable[[str, AgentDoing], object] = lambda run, doing: None
         self._parallel = parallel
 
@@ -208,12 +208,12 @@ def _columns(width: int, longest: int) -> dict[str, int]:
     return {title: widths[title] for title in _TITLES if title in widths}
 
 
-def _order(row: Row) -> int:
+def _order(row: RunLine) -> int:
     kinds = {"running": 0, "error": 1, "cancelled": 1, "waiting": 3}
     return kinds.get(row.state, 2 if row.state.startswith("on ") else 4)
 
 
-def _cells(row: Row) -> tuple[str, ...]:
+def _cells(row: RunLine) -> tuple[str, ...]:
     progress, tokens = row.progress, tokens_in(row.tokens)
     state = in_words(row.state)
     if row.state == "running" and row.phase is not None:

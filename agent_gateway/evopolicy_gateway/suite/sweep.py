@@ -21,7 +21,7 @@ from evopolicy_gateway.run.lifecycle import Leaves, RunLifecycle
 from evopolicy_gateway.run.operations import Operations
 from evopolicy_gateway.run.plan import Plan
 from evopolicy_gateway.run.record import why_failed
-from evopolicy_gateway.run.watch import View
+from evopolicy_gateway.run.watch import RunsView
 from evopolicy_gateway.suite.decisions import Decision, side_by_side
 from evopolicy_gateway.suite.suite_file import Parallel
 from evopolicy_gateway.suite.suite_index import directory_of, waiting
@@ -41,7 +41,7 @@ class Sweep(ABC):
     """Which of its runs cancelling this leaves to be resumed."""
 
     def __init__(
-        self, limits: Parallel, index: Index, operations: Operations, gateway: Credentials, watch: View
+        self, limits: Parallel, index: Index, operations: Operations, gateway: Credentials, watch: RunsView
     ) -> None:
         self._limits, self._index = limits, index
         self._operations, self._gateway, self._watch = operations, gateway, watch

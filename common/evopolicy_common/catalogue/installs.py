@@ -63,7 +63,7 @@ class Install(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
         return first <= sys.version_info[:2] < beyond
 
 
-class Made(msgspec.Struct, frozen=True, kw_only=True):
+class MadeEnvironment(msgspec.Struct, frozen=True, kw_only=True):
     """A virtual environment that `setup` made, as its file `MARK` describes it."""
 
     families: tuple[str, ...]
@@ -138,16 +138,16 @@ def root() -> Path:
     return Path(data, "evopolicy", "installs")
 
 
-def read_made(folder: Path) -> Made | None:
+def read_made(folder: Path) -> MadeEnvironment | None:
     """The description of a virtual environment; None when the folder is none that `setup` made."""
     try:
-        made = msgspec.json.decode((folder / MARK).read_bytes(), type=Made)
+        made = msgspec.json.decode((folder / MARK).read_bytes(), type=MadeEnvironment)
     except (OSError, msgspec.MsgspecError):
         return None
     return msgspec.structs.replace(made, folder=str(folder))
 
 
-def made() -> list[Made]:
+def made() -> list[MadeEnvironment]:
     """The finished virtual environments of this user, the latest first."""
     try:
         folders = list(root().iterdir())
@@ -155,7 +155,7 @@ def made() -> list[Made]:
         return []
     ready = [made for each in folders if (made := read_made(each)) is not None and made.ready]
 
-    def finished_at(made: Made) -> float:
+    def finished_at(made: MadeEnvironment) -> float:
         with contextlib.suppress(OSError):
             return Path(made.folder, MARK).stat().st_mtime
         return 0.0

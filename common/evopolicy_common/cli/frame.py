@@ -116,7 +116,7 @@ class Command(_Help, TyperCommand):
     """A command with grouped help."""
 
 
-class Group(_Help, TyperGroup):
+class CommandGroup(_Help, TyperGroup):
     """A command group; without a subcommand it shows its help and exits with a usage error."""
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:
@@ -143,7 +143,7 @@ class App(typer.Typer):
     """Our `typer.Typer`: `-h`, plain grouped help, and no traceback formatting by typer."""
 
     def __init__(self, **options: Any) -> None:
-        usual = {"cls": Group, "rich_markup_mode": None, "add_completion": False}
+        usual = {"cls": CommandGroup, "rich_markup_mode": None, "add_completion": False}
         super().__init__(**(usual | {"context_settings": _SETTINGS} | options))
 
     def command(self, name: str | None = None, **options: object) -> Callable[[Function], Function]:

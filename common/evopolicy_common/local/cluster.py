@@ -34,7 +34,7 @@ from evopolicy_common.processes.scratch import scratch_folder
 from evopolicy_common.records.blobs import write_atomically
 from evopolicy_common.records.open_run import is_held
 from evopolicy_common.wire import credentials, transport
-from evopolicy_common.wire.credentials import WORKERS, Ready, read_ready
+from evopolicy_common.wire.credentials import WORKERS, ReadyCluster, read_ready
 from evopolicy_common.wire.operator_client import OperatorClient
 
 T = TypeVar("T")
@@ -64,7 +64,7 @@ class LocalCluster:
 
     def __init__(
         self,
-        ready: Ready,
+        ready: ReadyCluster,
         processes: _Processes,
         start_workers: Callable[[Workers], Awaitable[None]],
         kept: Path | None,

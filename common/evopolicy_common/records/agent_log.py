@@ -16,7 +16,7 @@ import msgspec
 _NOTES = ("turn_failed", "paused", "permission", "log_full", "result", "error")
 
 
-class Part(msgspec.Struct, frozen=True, kw_only=True):
+class LogPart(msgspec.Struct, frozen=True, kw_only=True):
     kind: Literal["prompt", "text", "thinking", "call", "result", "stdout", "stderr", "note"]
     value: Any
     """A text, a call's arguments, a result's content, or a note's fields, as the line has them."""
@@ -31,10 +31,10 @@ class Part(msgspec.Struct, frozen=True, kw_only=True):
     """Claude Code repeats a message's id with each of its blocks; empty if there is none."""
 
 
-def parts(line: dict[str, object]) -> Iterator[Part]:
+def parts(line: dict[str, object]) -> Iterator[LogPart]:
     match line:
         case {"type": "prompt"}:
-            yield Part(kind="prompt", value=line.get("message"), by_agent=False)
+            yield LogPart(kind="prompt", value=line.get("message"), by_agent=False)
         case {"type": "assistant" | "user" as role, "message": dict(message)}:
             content = message.get("content")
             blocks = content if isinstance(content, list) else [{"type": "text", "text": content}]
@@ -44,45 +44,47 @@ def parts(line: dict[str, object]) -> Iterator[Part]:
         case {"type": "item.completed", "item": dict(item)}:
             yield from _item(item)
         case {"type": "stdout" | "stderr" as kind, "text": str(text)}:
-            yield Part(kind=kind, value=text)
+            yield LogPart(kind=kind, value=text)
         case {"type": str(kind)} if kind in _NOTES:
             fields = {name: value for name, value in line.items() if name not in ("type", "timestamp")}
-            yield Part(kind="note", name=kind, value=fields, by_agent=False)
+            yield LogPart(kind="note", name=kind, value=fields, by_agent=False)
         case {"turn": int(), "text": str(text)}:
-            yield Part(kind="text", value=text)
+            yield LogPart(kind="text", value=text)
 
 
-def _block(block: dict[str, object], by_agent: bool, message: str) -> Iterator[Part]:
+def _block(block: dict[str, object], by_agent: bool, message: str) -> Iterator[LogPart]:
     match block.get("type"):
         case "text" | "thinking" as kind:
-            yield Part(kind=kind, value=block.get(kind), by_agent=by_agent, message=message)
+            yield LogPart(kind=kind, value=block.get(kind), by_agent=by_agent, message=message)
         case "tool_use":
             name, call = _name(block.get("name")), _name(block.get("id"))
-            yield Part(
+            yield LogPart(
                 kind="call", name=name, id=call, value=block.get("input"), by_agent=by_agent, message=message
             )
         case "tool_result":
             failed, call = block.get("is_error") is True, _name(block.get("tool_use_id"))
-            yield Part(kind="result", value=block.get("content"), id=call, failed=failed, by_agent=False)
+            yield LogPart(kind="result", value=block.get("content"), id=call, failed=failed, by_agent=False)
 
 
-def _item(item: dict[str, object]) -> Iterator[Part]:
+def _item(item: dict[str, object]) -> Iterator[LogPart]:
     """A completed item of Codex: a text, or a call together with its result."""
     kind, call = _name(item.get("type") or item.get("item_type")), _name(item.get("id"))
     failed = item.get("status") == "failed" or item.get("exit_code") not in (0, None)
     if kind in ("agent_message", "assistant_message", "reasoning"):
-        yield Part(kind="thinking" if kind == "reasoning" else "text", value=item.get("text"))
+        yield LogPart(kind="thinking" if kind == "reasoning" else "text", value=item.get("text"))
     elif kind == "command_execution":
-        yield Part(kind="call", name="shell", id=call, value=item.get("command"))
-        yield Part(kind="result", value=item.get("aggregated_output"), id=call, failed=failed, by_agent=False)
+        yield LogPart(kind="call", name="shell", id=call, value=item.get("command"))
+        yield LogPart(
+            kind="result", value=item.get("aggregated_output"), id=call, failed=failed, by_agent=False
+        )
     elif kind == "mcp_tool_call":
         name = f"{_name(item.get('server'))}.{_name(item.get('tool'))}"
         answer = item.get("error") or item.get("result")
-        yield Part(kind="call", name=name, id=call, value=item.get("arguments"))
-        yield Part(kind="result", value=answer, id=call, failed=failed, by_agent=False)
+        yield LogPart(kind="call", name=name, id=call, value=item.get("arguments"))
+        yield LogPart(kind="result", value=answer, id=call, failed=failed, by_agent=False)
     else:
         given = {name: value for name, value in item.items() if name not in ("id", "type", "item_type")}
-        yield Part(kind="call", name=kind, id=call, value=given)
+        yield LogPart(kind="call", name=kind, id=call, value=given)
 
 
 def _name(value: object) -> str:

@@ -48,7 +48,7 @@ class JournalLine(msgspec.Struct, frozen=True, kw_only=True, tag_field="op"):
     that was requested last."""
 
 
-class Requested(JournalLine, frozen=True, kw_only=True, tag="requested"):
+class SubmitRequested(JournalLine, frozen=True, kw_only=True, tag="requested"):
     """A submit that passed the checks; written before anything of it is sent."""
 
     submit: Submit
@@ -58,7 +58,7 @@ class Requested(JournalLine, frozen=True, kw_only=True, tag="requested"):
     body_digest: str
     """SHA-256 of the request's body, hex."""
     kept: str | None = None
-    """As in `Snapshot`."""
+    """As in `SystemSnapshot`."""
 
 
 class Settled(JournalLine, frozen=True, kw_only=True, tag="settled"):
@@ -70,7 +70,7 @@ class Settled(JournalLine, frozen=True, kw_only=True, tag="settled"):
     """The text of `summary.json`, byte for byte."""
 
 
-class Refused(JournalLine, frozen=True, kw_only=True, tag="refused"):
+class SubmitRefused(JournalLine, frozen=True, kw_only=True, tag="refused"):
     """The coordinator refused it, and nothing was charged; or the gateway failed twice on it, and it is not retried. It
     has no feedback."""
 
@@ -93,5 +93,5 @@ class Died(JournalLine, frozen=True, kw_only=True, tag="died"):
     """Request indices of these episodes; empty: the submit as a whole."""
 
 
-AnyLine = Requested | SubmitAccepted | Settled | Refused | Rejected | Died
+AnyLine = SubmitRequested | SubmitAccepted | Settled | SubmitRefused | Rejected | Died
 line_decoder = msgspec.json.Decoder(AnyLine)

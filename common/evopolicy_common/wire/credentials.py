@@ -242,7 +242,7 @@ def _registered(endpoint: str) -> Path:
     return state_home() / "clusters" / digest_of(endpoint.encode())[:32]
 
 
-class Ready(msgspec.Struct, frozen=True, kw_only=True):
+class ReadyCluster(msgspec.Struct, frozen=True, kw_only=True):
     """How to reach a coordinator."""
 
     cluster: str
@@ -255,10 +255,10 @@ class Ready(msgspec.Struct, frozen=True, kw_only=True):
     """A note for the operator on the cases of new runs; empty for none."""
 
 
-async def read_ready(path: Path, failed: asyncio.Future[None]) -> Ready:
+async def read_ready(path: Path, failed: asyncio.Future[None]) -> ReadyCluster:
     """Waits for the file and reads it. `failed` ends only with an error, which is raised here if it comes first."""
     while not path.exists():
         if failed.done():
             failed.result()
         await asyncio.sleep(_LOOK_S)
-    return msgspec.json.decode(path.read_bytes(), type=Ready)
+    return msgspec.json.decode(path.read_bytes(), type=ReadyCluster)

@@ -166,7 +166,7 @@ def first_endpoint(root: Path) -> str:
     return f"tls/[{host}]:{PORT}" if ":" in host else f"tls/{host}:{PORT}"
 
 
-def _certificate(root: Path) -> certs.Described:
+def _certificate(root: Path) -> certs.CertFields:
     own = machines.coordinators_certificate(root)
     if own is None:
         raise ConfigError(f"{root} has no certificate authority yet: evopolicy-coordinator certs init")

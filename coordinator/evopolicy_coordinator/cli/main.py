@@ -17,7 +17,7 @@ from evopolicy_common.errors import ConfigError
 from evopolicy_common.processes.packages import checked_names
 from evopolicy_common.records.blobs import announcing
 from evopolicy_common.terminal import counted, say
-from evopolicy_common.wire.credentials import Ready, default_state_dir
+from evopolicy_common.wire.credentials import ReadyCluster, default_state_dir
 from evopolicy_coordinator.cli import certs as certs_cli
 from evopolicy_coordinator.cli import doctor as doctor_cli
 from evopolicy_coordinator.cli import epochs as epochs_cli
@@ -25,7 +25,7 @@ from evopolicy_coordinator.cli import router_config
 from evopolicy_coordinator.cli import worlds as worlds_cli
 from evopolicy_coordinator.core.contract.settings import CoreSettings
 from evopolicy_coordinator.server import process
-from evopolicy_coordinator.server.process import Options
+from evopolicy_coordinator.server.process import CoordinatorOptions
 from evopolicy_coordinator.storage.backup import back_up
 from evopolicy_coordinator.storage.moving import move, move_blobs
 
@@ -177,7 +177,7 @@ def serve(
     if context.invoked_subcommand is not None:
         return
     setup_logging(log_level)
-    options = Options(
+    options = CoordinatorOptions(
         state=state or default_state_dir(),
         data=data,
         store=store,
@@ -252,13 +252,13 @@ def move_(
     say("next: start the coordinator on the same state folder")
 
 
-async def _run(options: Options, announce: Callable[[bytes], None]) -> None:
+async def _run(options: CoordinatorOptions, announce: Callable[[bytes], None]) -> None:
     stop = asyncio.Event()
     loop = asyncio.get_running_loop()
     for number in (signal.SIGTERM, signal.SIGINT):
         loop.add_signal_handler(number, stop.set)
 
-    def on_ready(ready: Ready) -> None:
+    def on_ready(ready: ReadyCluster) -> None:
         endpoint = ready.endpoints[-1]
         command = (
             f"evopolicy-worker --env core16 --connect {endpoint} --credentials {ready.credentials['worker']}"

@@ -33,7 +33,7 @@ from evopolicy_coordinator.core.status import Words
 from evopolicy_coordinator.core.tables import step
 from evopolicy_coordinator.core.tables.model import LaneKey, Run
 from evopolicy_coordinator.core.tables.state import Loading, State
-from evopolicy_coordinator.core.tables.step import EpisodesDone, Step
+from evopolicy_coordinator.core.tables.step import CoreStep, EpisodesDone
 from evopolicy_coordinator.core.workers import membership, results, scheduler
 
 TICK_S = 1.0
@@ -54,14 +54,14 @@ class Core:
     def load(cls, settings: CoreSettings, snapshot: Snapshot, now: float) -> tuple[Core, list[Effect]]:
         """Returns a core that continues from the snapshot, and the first effects to carry out."""
         core = cls(settings, snapshot.incarnation, now)
-        first = Step(now, f"load-{snapshot.incarnation}")
+        first = CoreStep(now, f"load-{snapshot.incarnation}")
         load(core.state, snapshot, first)
         return core, core._end(first)
 
     def handle(self, event: events.AnyEvent, now: float) -> list[Effect]:
         """Process an event; the shell carries out the returned effects in order."""
         self._watch(now)
-        this = Step(now, event.stimulus_id)
+        this = CoreStep(now, event.stimulus_id)
         try:
             EVENTS[type(getattr(event, "message", event))](self.state, event, this)
         except NotDoneError as refused:
@@ -82,7 +82,7 @@ class Core:
         effects: list[Effect] = []
         while (key := self.state.timers.pop_due(now)) is not None:
             kind, what = key
-            this = Step(now, f"{kind}-{what}")
+            this = CoreStep(now, f"{kind}-{what}")
             TIMERS[kind](self.state, what, this)
             effects += self._end(this)
         return effects
@@ -108,7 +108,7 @@ class Core:
                 state.stalled_at = now
         self._called_at = now
 
-    def _end(self, this: Step) -> list[Effect]:
+    def _end(self, this: CoreStep) -> list[Effect]:
         """Deliver the news of the step and lease the work that became available."""
         if this.news:
             drain(self.state, this)
@@ -120,7 +120,7 @@ class Core:
         return this.effects()
 
 
-def drain(state: State, this: Step) -> None:
+def drain(state: State, this: CoreStep) -> None:
     """Deliver the news of a step in order. The consequences of a piece of news come before the
     pieces queued after it."""
     pending = this.news
@@ -136,17 +136,19 @@ def drain(state: State, this: Step) -> None:
 
 # ---- the tables ----
 
-Rule = Callable[[State, Any, Step], None]
+Rule = Callable[[State, Any, CoreStep], None]
 M = TypeVar("M", bound=Message)
 T = TypeVar("T")
 
 
-def _request(message: type[M], rule: Callable[[State, events.Requested[M], Step], None]) -> tuple[type, Rule]:
+def _request(
+    message: type[M], rule: Callable[[State, events.Requested[M], CoreStep], None]
+) -> tuple[type, Rule]:
     """The rule for a request, which mypy compares with the type of its message."""
     return message, rule
 
 
-def _event(key: type, event: type[T], rule: Callable[[State, T, Step], None]) -> tuple[type, Rule]:
+def _event(key: type, event: type[T], rule: Callable[[State, T, CoreStep], None]) -> tuple[type, Rule]:
     """The rule for an event with fields of its own."""
     return key, rule
 
@@ -181,7 +183,7 @@ EVENTS: dict[type, Rule] = dict(
 
 
 def _news(
-    news: type[T], kinds: str, *rules: Callable[[State, T, Step], None]
+    news: type[T], kinds: str, *rules: Callable[[State, T, CoreStep], None]
 ) -> dict[tuple[type, str], tuple[Rule, ...]]:
     """The rules for a piece of news, of each of these kinds."""
     return {(news, kind): rules for kind in kinds.split() or [""]}
@@ -207,14 +209,14 @@ NEWS: dict[tuple[type, str], tuple[Rule, ...]] = {
 # ---- timers ----
 
 
-def _poll_ended(state: State, request: events.RequestId, this: Step) -> None:
+def _poll_ended(state: State, request: events.RequestId, this: CoreStep) -> None:
     """Answer a long poll whose time is up with the current state."""
     poll = state.polls.take_poll(request)
     if poll is not None:
         POLLS[poll.kind](state, poll, this)
 
 
-def _check_lane(state: State, key: LaneKey, this: Step) -> None:
+def _check_lane(state: State, key: LaneKey, this: CoreStep) -> None:
     lane = state.lanes.get(key)
     if lane is not None:
         this.dirty[lane] = None
@@ -246,7 +248,7 @@ TIMERS: dict[str, Rule] = {
 """The rule for each deadline: by its kind; the rule gets the deadline's subject."""
 
 
-def load(state: State, snapshot: Snapshot, step: Step) -> None:
+def load(state: State, snapshot: Snapshot, step: CoreStep) -> None:
     """Fill an empty state so that no accepted submit is lost and no finished episode is played again.
 
     Budgets are rebuilt from submits, open groups from submits and outcomes; groups that were complete but not concluded
@@ -297,7 +299,7 @@ def load(state: State, snapshot: Snapshot, step: Step) -> None:
     step.log("info", "core_loaded", incarnation=state.incarnation, runs=len(state.runs), jobs=len(state.jobs))
 
 
-def _run(state: State, run: Run, rows: list[SubmitRow], loading: Loading, step: Step) -> None:
+def _run(state: State, run: Run, rows: list[SubmitRow], loading: Loading, step: CoreStep) -> None:
     if run.state.fingerprint_class is not None:
         pins.place(state, run.flow, run.state.fingerprint_class, step)
         run.flow.description = run.state.description

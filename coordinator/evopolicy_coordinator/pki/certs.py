@@ -32,14 +32,14 @@ CLOCK_SKEW = dt.timedelta(hours=1)
 _HOST_NAME = re.compile(r"(?!-)[A-Za-z0-9_-]{1,63}(?<!-)(\.(?!-)[A-Za-z0-9_-]{1,63}(?<!-))*")
 
 
-class Pair(msgspec.Struct, frozen=True):
+class KeyPair(msgspec.Struct, frozen=True):
     """A certificate and its private key, both PEM."""
 
     certificate: bytes
     private_key: bytes
 
 
-class Described(msgspec.Struct, frozen=True, kw_only=True):
+class CertFields(msgspec.Struct, frozen=True, kw_only=True):
     """The fields of a certificate that we use."""
 
     serial: str
@@ -49,7 +49,7 @@ class Described(msgspec.Struct, frozen=True, kw_only=True):
     """DNS names and addresses that clients may dial, as given."""
 
 
-def make_authority(cluster: str, now: dt.datetime, days: int = AUTHORITY_DAYS) -> Pair:
+def make_authority(cluster: str, now: dt.datetime, days: int = AUTHORITY_DAYS) -> KeyPair:
     """Creates an authority. Its name has a random part, so that two authorities of one cluster are never confused."""
     key = ec.generate_private_key(ec.SECP256R1())
     name = _name(f"evopolicy {cluster[:24]} {x509.random_serial_number():x}"[:64])
@@ -64,8 +64,14 @@ def make_authority(cluster: str, now: dt.datetime, days: int = AUTHORITY_DAYS) -
 
 
 def issue(
-    authority: Pair, common_name: str, now: dt.datetime, days: int, *, hosts: Sequence[str] = (), serves: bool
-) -> Pair:
+    authority: KeyPair,
+    common_name: str,
+    now: dt.datetime,
+    days: int,
+    *,
+    hosts: Sequence[str] = (),
+    serves: bool,
+) -> KeyPair:
     """Issues a certificate with a new key, signed by `authority`. `hosts`: DNS names and IP addresses that
     clients dial; required when it `serves`. Raises ConfigError for an invalid name, or a validity beyond the
     authority's own."""
@@ -96,7 +102,7 @@ def issue(
     return _pair(builder.sign(signer, hashes.SHA256()), key)
 
 
-def describe(certificate: bytes) -> Described:
+def describe(certificate: bytes) -> CertFields:
     """Parses a PEM certificate. Raises ConfigError when it is not one."""
     try:
         parsed = x509.load_pem_x509_certificate(certificate)
@@ -106,7 +112,7 @@ def describe(certificate: bytes) -> Described:
         hosts = ()
     except ValueError as error:
         raise ConfigError(f"not a certificate in PEM form: {error}") from error
-    return Described(serial=f"{parsed.serial_number:x}", expires=parsed.not_valid_after_utc, hosts=hosts)
+    return CertFields(serial=f"{parsed.serial_number:x}", expires=parsed.not_valid_after_utc, hosts=hosts)
 
 
 def check_hosts(hosts: Sequence[str]) -> None:
@@ -157,8 +163,8 @@ def _key_usage(*, signs_certificates: bool) -> x509.KeyUsage:
     )
 
 
-def _pair(certificate: x509.Certificate, key: ec.EllipticCurvePrivateKey) -> Pair:
-    return Pair(
+def _pair(certificate: x509.Certificate, key: ec.EllipticCurvePrivateKey) -> KeyPair:
+    return KeyPair(
         certificate.public_bytes(serialization.Encoding.PEM),
         key.private_bytes(
             serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()

@@ -215,7 +215,7 @@ def revoke(state: Path, name: str, now: dt.datetime) -> tuple[Machine, ...]:
     return tuple(listed[machine.identity] for machine in meant)
 
 
-def coordinators_certificate(state: Path) -> certs.Described | None:
+def coordinators_certificate(state: Path) -> certs.CertFields | None:
     """The coordinator's own certificate; None before `init`."""
     try:
         return certs.describe((state / "certs" / "coordinator.pem").read_bytes())
@@ -224,8 +224,13 @@ def coordinators_certificate(state: Path) -> certs.Described | None:
 
 
 def _make(
-    authority: certs.Pair, role: MachineRole, name: str, hosts: tuple[str, ...], now: dt.datetime, days: int
-) -> tuple[Machine, certs.Pair]:
+    authority: certs.KeyPair,
+    role: MachineRole,
+    name: str,
+    hosts: tuple[str, ...],
+    now: dt.datetime,
+    days: int,
+) -> tuple[Machine, certs.KeyPair]:
     common_name = f"{role}/{name}"
     if len(common_name) > 64:
         raise ConfigError(f"NAME {name!r} is too long: {common_name!r} has over 64 characters")
@@ -244,7 +249,7 @@ def _make(
 
 
 def _write_folder(
-    out: Path, machine: Machine, pair: certs.Pair, prefix: str, cluster: str, endpoints: tuple[str, ...]
+    out: Path, machine: Machine, pair: certs.KeyPair, prefix: str, cluster: str, endpoints: tuple[str, ...]
 ) -> None:
     _write(out / f"{prefix}cert.pem", pair.certificate)
     _write(out / f"{prefix}key.pem", pair.private_key)
@@ -280,9 +285,9 @@ def _changing(state: Path) -> Iterator[Path]:
         os.close(fd)
 
 
-def _authority(folder: Path) -> certs.Pair:
+def _authority(folder: Path) -> certs.KeyPair:
     try:
-        return certs.Pair((folder / "ca.pem").read_bytes(), (folder / "ca-key.pem").read_bytes())
+        return certs.KeyPair((folder / "ca.pem").read_bytes(), (folder / "ca-key.pem").read_bytes())
     except FileNotFoundError as error:
         raise ConfigError(
             f"{folder.parent} has no certificate authority yet: evopolicy-coordinator certs init"

@@ -40,7 +40,7 @@ _FREE = ClaimRow(holder="")
 _rows = msgspec.msgpack.Decoder(ClaimRow)
 
 
-class Claims:
+class ClaimTable:
     """All claims; loaded from the store on the first request."""
 
     def __init__(self, writer: Writer) -> None:

@@ -27,7 +27,7 @@ from evopolicy_coordinator.core.contract.settings import CoreSettings
 from evopolicy_coordinator.core.machine import Core
 from evopolicy_coordinator.storage.sealing import SharedFiles
 from evopolicy_coordinator.storage.store import Store
-from evopolicy_coordinator.storage.writer import Outbox, Writer
+from evopolicy_coordinator.storage.writer import EffectQueue, Writer
 
 _FIRST_PAUSE_S = 0.2
 _LONGEST_PAUSE_S = 5.0
@@ -60,7 +60,7 @@ class CoreHost:
         self._carry_out = carry_out
         self._dropped = dropped
         self._loop = asyncio.get_running_loop()
-        self._outbox: Outbox | None = None
+        self._outbox: EffectQueue | None = None
         self.core: Core | None = None
         self.last_core: Core | None = None
         """While the store cannot be written: the core that it refused, for reading."""
@@ -280,7 +280,7 @@ class CoreHost:
         # The clock may have been set back while no coordinator ran. Nothing may end before it started.
         self._unix_offset += max(0.0, latest_time(snapshot) - self.now())
         self.core, effects = Core.load(self._settings, snapshot, self.now())
-        self._outbox = Outbox(self._writer, self._carry_out, self._on_write_failure)
+        self._outbox = EffectQueue(self._writer, self._carry_out, self._on_write_failure)
         self._outbox.put(effects)
         self.storage_error, self.last_core = "", None
         log.info("loaded", incarnation=snapshot.incarnation, runs=len(snapshot.runs))

@@ -21,7 +21,7 @@ from evopolicy_common.errors import ConfigError, DamagedStoreError, LeadLostErro
 from evopolicy_common.logs import log
 from evopolicy_common.processes.packages import SIMULATORS
 from evopolicy_common.wire import credentials, transport
-from evopolicy_common.wire.credentials import Ready
+from evopolicy_common.wire.credentials import ReadyCluster
 from evopolicy_coordinator.core.contract.settings import CoreSettings
 from evopolicy_coordinator.pki.identity import SIGNING_KEY
 from evopolicy_coordinator.pki.machines import Machines
@@ -60,7 +60,7 @@ _PAUSE_S = 0.1
 """Between attempts to lead, seconds."""
 
 
-class Options(msgspec.Struct, frozen=True, kw_only=True):
+class CoordinatorOptions(msgspec.Struct, frozen=True, kw_only=True):
     state: Path
     data: Path | None = None
     """Folder of split files; None: derive the splits from the state folder's secret."""
@@ -88,7 +88,9 @@ class Options(msgspec.Struct, frozen=True, kw_only=True):
     core: CoreSettings = CoreSettings()
 
 
-async def run(options: Options, stop: asyncio.Event, on_ready: Callable[[Ready], None]) -> None:
+async def run(
+    options: CoordinatorOptions, stop: asyncio.Event, on_ready: Callable[[ReadyCluster], None]
+) -> None:
     """Serves until `stop` is set, then makes everything durable and returns.
 
     Raises ConfigError for wrong options or a folder that is in use, StorageError when the store cannot be read,
@@ -130,7 +132,7 @@ async def run(options: Options, stop: asyncio.Event, on_ready: Callable[[Ready],
 
 
 async def _opened(
-    options: Options, stop: asyncio.Event, on_ready: Callable[[Ready], None]
+    options: CoordinatorOptions, stop: asyncio.Event, on_ready: Callable[[ReadyCluster], None]
 ) -> StateFolder | None:
     """The state folder, None at `stop`. While another command's coordinator of the same local cluster has it, this one
     names that one as ready, and waits to take its place."""
@@ -155,14 +157,14 @@ async def _pause(stop: asyncio.Event) -> None:
 
 
 async def _lead(
-    options: Options,
+    options: CoordinatorOptions,
     state: StateFolder,
     places: tuple[Place, Place],
     shared: SharedFiles,
     machines: Machines,
     listening: tuple[tuple[str, ...], tuple[str, ...]],
     stop: asyncio.Event,
-    on_ready: Callable[[Ready], None],
+    on_ready: Callable[[ReadyCluster], None],
 ) -> None:
     """Serves while this coordinator leads, until `stop`. `places`: of rows and blobs. Raises LeadLostError when another
     one leads."""
@@ -227,7 +229,7 @@ async def _lead(
         declare_all(server, cluster, liveliness)
         credentials.publish(endpoints, state.credentials)
         opened.callback(credentials.withdraw, endpoints)
-        ready = Ready(
+        ready = ReadyCluster(
             cluster=cluster,
             endpoints=(*endpoints, *reachable(remote)),
             credentials={role: str(path) for role, path in files.items()},
@@ -257,7 +259,7 @@ async def _until(stop: asyncio.Event, service: Service) -> None:
 
 
 def _listen(
-    state: StateFolder, options: Options, machines: Machines
+    state: StateFolder, options: CoordinatorOptions, machines: Machines
 ) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Returns the endpoints for this machine (with the state folder's socket if possible) and for others."""
     for endpoint in options.listen:

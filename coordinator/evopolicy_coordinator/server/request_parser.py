@@ -203,7 +203,7 @@ class RequestParser:
         return _bounded_cursor(m)
 
 
-class Request(NamedTuple):
+class RequestKind(NamedTuple):
     """How requests of one kind are served. An operator's have no verb: all have the same key."""
 
     verb: str = ""
@@ -220,27 +220,29 @@ def _bounded_cursor(m: P) -> P:
     return replace(m, cursor=checks.finite_cursor(m.cursor))
 
 
-REQUESTS: dict[type[Message], Request] = {
-    **dict.fromkeys(get_args(operator.OperatorRequest), Request()),
-    worker.Register: Request("register"),
-    worker.LeaseRequest: Request("lease", waits=True),
-    worker.Heartbeat: Request("beat", waits=True),
-    worker.ReportResults: Request("done", RequestParser._checked_results),
-    BlobPut: Request("blob"),
-    BlobGet: Request("blob"),
-    gateway.OpenRun: Request("open"),
-    gateway.RequestPermit: Request("permit", lambda _, m: checks.check_place(m.boot_id, m.host), waits=True),
-    gateway.StateRequest: Request("state"),
-    gateway.Submit: Request("submit", RequestParser._check_submit, creates=True),
-    gateway.ResultsRequest: Request("results", RequestParser._check_poll, waits=True),
-    gateway.CloseRun: Request("close", lambda _, m: checks.bounded_close(m)),
-    operator.CreateRun: Request(creates=True),
-    operator.Evaluate: Request(creates=True),
-    operator.Rescore: Request(creates=True),
-    operator.Disclose: Request(creates=True),
-    operator.WaitRun: Request(waits=True),
-    operator.EvaluationPoll: Request(check=lambda _, m: _bounded_cursor(m), waits=True),
-    operator.RepinRun: Request(
+REQUESTS: dict[type[Message], RequestKind] = {
+    **dict.fromkeys(get_args(operator.OperatorRequest), RequestKind()),
+    worker.Register: RequestKind("register"),
+    worker.LeaseRequest: RequestKind("lease", waits=True),
+    worker.Heartbeat: RequestKind("beat", waits=True),
+    worker.ReportResults: RequestKind("done", RequestParser._checked_results),
+    BlobPut: RequestKind("blob"),
+    BlobGet: RequestKind("blob"),
+    gateway.OpenRun: RequestKind("open"),
+    gateway.RequestPermit: RequestKind(
+        "permit", lambda _, m: checks.check_place(m.boot_id, m.host), waits=True
+    ),
+    gateway.StateRequest: RequestKind("state"),
+    gateway.Submit: RequestKind("submit", RequestParser._check_submit, creates=True),
+    gateway.ResultsRequest: RequestKind("results", RequestParser._check_poll, waits=True),
+    gateway.CloseRun: RequestKind("close", lambda _, m: checks.bounded_close(m)),
+    operator.CreateRun: RequestKind(creates=True),
+    operator.Evaluate: RequestKind(creates=True),
+    operator.Rescore: RequestKind(creates=True),
+    operator.Disclose: RequestKind(creates=True),
+    operator.WaitRun: RequestKind(waits=True),
+    operator.EvaluationPoll: RequestKind(check=lambda _, m: _bounded_cursor(m), waits=True),
+    operator.RepinRun: RequestKind(
         check=lambda _, m: require(bool(m.reason.strip()), Refusal.BAD_MESSAGE, _NO_REASON)
     ),
 }

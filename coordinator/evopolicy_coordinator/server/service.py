@@ -47,7 +47,7 @@ from evopolicy_coordinator.core.contract.settings import CoreSettings
 from evopolicy_coordinator.core.machine import Core
 from evopolicy_coordinator.core.runs import finished
 from evopolicy_coordinator.core.tables.model import Worker
-from evopolicy_coordinator.server.claims import Claims
+from evopolicy_coordinator.server.claims import ClaimTable
 from evopolicy_coordinator.server.core_host import CoreHost
 from evopolicy_coordinator.server.definitions import failed, undescribed
 from evopolicy_coordinator.server.reader import ServiceReader, answer_bytes, answer_to, damaged, lane_of
@@ -99,7 +99,7 @@ class Service:
         self._settings = settings
         self._loop = asyncio.get_running_loop()
         self._writer = Writer(store)
-        self._claims = Claims(self._writer)
+        self._claims = ClaimTable(self._writer)
         self._pending: dict[int | str, Pending] = {}
         """By the number under which the core knows the query, oldest first; numbers are never reused."""
         self._n_requests = 0

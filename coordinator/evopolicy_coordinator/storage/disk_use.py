@@ -74,7 +74,7 @@ class EnvironmentUse(msgspec.Struct):
         return self.bytes / self.train_episodes
 
 
-class Estimate(msgspec.Struct, frozen=True, kw_only=True):
+class DiskEstimate(msgspec.Struct, frozen=True, kw_only=True):
     """Estimated disk use of a sweep on the coordinator."""
 
     bytes: int
@@ -179,11 +179,11 @@ def use(state: Path) -> list[EnvironmentUse]:
     return sorted(by_env.values(), key=lambda each: -each.bytes)
 
 
-def estimate(state: Path, planned: dict[str, int]) -> Estimate:
+def estimate(state: Path, planned: dict[str, int]) -> DiskEstimate:
     """Estimates the disk use of `planned` train episodes by environment, from the stored episodes of each."""
     known = {each.env: each.bytes_per_episode for each in use(state)}
     guess = max(known.values(), default=float(GUESS_BYTES))
-    return Estimate(
+    return DiskEstimate(
         bytes=round(sum(n * known.get(env, guess) for env, n in planned.items())),
         free_bytes=shutil.disk_usage(state).free,
         guessed=tuple(env for env in planned if env not in known),

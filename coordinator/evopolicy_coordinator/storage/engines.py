@@ -39,7 +39,7 @@ DATABASE = "coordinator.sqlite"
 """Name of the SQLite file in a state folder."""
 
 
-class Part(NamedTuple):
+class StatePart(NamedTuple):
     """A part of the state: the file or folder that has it in the state folder, the file there that says where it is
     instead, and the options of `evopolicy-coordinator` and its `move` that name the place."""
 
@@ -50,8 +50,8 @@ class Part(NamedTuple):
     move: str
 
 
-ROWS = Part("rows", DATABASE, "store", "--store", "--to")
-BLOBS = Part("blobs", "blobs", "blob-store", "--blobs", "--blobs")
+ROWS = StatePart("rows", DATABASE, "store", "--store", "--to")
+BLOBS = StatePart("blobs", "blobs", "blob-store", "--blobs", "--blobs")
 
 LOCK_WAIT_S = 4.0
 """Longest wait for the database's lock in one attempt."""
@@ -370,7 +370,7 @@ def checked_address(address: str) -> str:
     return address
 
 
-def place_of(root: Path, part: Part = ROWS) -> Place:
+def place_of(root: Path, part: StatePart = ROWS) -> Place:
     """Where this part of a state folder is. Raises ConfigError when the folder has no rows."""
     with contextlib.suppress(FileNotFoundError):
         noted = (root / part.note).read_text().strip()
@@ -380,7 +380,7 @@ def place_of(root: Path, part: Part = ROWS) -> Place:
     return root / part.own
 
 
-def chosen_place(root: Path, part: Part, named: Place | None) -> Place:
+def chosen_place(root: Path, part: StatePart, named: Place | None) -> Place:
     """Where this part of a state folder is, or for a new one shall be. `named`: by the operator, checked; None: as the
     folder says, else its own. Raises ConfigError when they contradict each other."""
     own = root / part.own
@@ -393,7 +393,7 @@ def chosen_place(root: Path, part: Part, named: Place | None) -> Place:
     return known or named or own
 
 
-def record_place(root: Path, part: Part, place: Place) -> None:
+def record_place(root: Path, part: StatePart, place: Place) -> None:
     """Durably notes in the state folder where this part is."""
     if place == root / part.own:
         (root / part.note).unlink(missing_ok=True)

@@ -40,7 +40,7 @@ from evopolicy_common.processes.preflight import check_writable, refused
 from evopolicy_common.records.blobs import write_atomically
 from evopolicy_common.records.open_run import is_held
 from evopolicy_common.wire import credentials
-from evopolicy_common.wire.credentials import WORKERS, Credentials, Ready, Role
+from evopolicy_common.wire.credentials import WORKERS, Credentials, ReadyCluster, Role
 
 ROLES: tuple[Role, ...] = ("worker", "gateway", "operator")
 _SOCKET = "coordinator.sock"
@@ -72,7 +72,7 @@ class Holder(msgspec.Struct, frozen=True, kw_only=True):
     process: int
     local: dict[str, str] | None = None
     """The options of a local cluster that its commands have to share, by name; None: another coordinator."""
-    ready: Ready | None = None
+    ready: ReadyCluster | None = None
     """None: it does not serve yet."""
 
 
@@ -86,7 +86,7 @@ class InUseError(ConfigError):
         )
         self.root, self.holder = root, holder
 
-    def shared(self, local: Mapping[str, str] | None) -> Ready | None:
+    def shared(self, local: Mapping[str, str] | None) -> ReadyCluster | None:
         """How a local cluster with these options reaches the coordinator that serves here; None: it is starting. Raises
         ConfigError when it is none of a local cluster, or has other options."""
         holder = self.holder
@@ -169,7 +169,7 @@ class StateFolder:
         lines = [f"{role}:{self.identity.passwords[role]}\n" for role in ROLES]
         write_atomically(self.passwords, "".join(lines).encode(), mode=0o600)
 
-    def serving(self, ready: Ready) -> None:
+    def serving(self, ready: ReadyCluster) -> None:
         """Tells the coordinators of further local commands how to reach this one."""
         _write(self._lock_fd, msgspec.structs.replace(self._holder, ready=ready))
 

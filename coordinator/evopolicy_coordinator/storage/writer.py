@@ -2,7 +2,7 @@
 
 Rules that this module owns:
 - Work runs in the order of its submission; its results are reported on the event loop, in the same order.
-- Group commit: `Outbox` submits all waiting rows as one transaction and meanwhile collects the next.
+- Group commit: `EffectQueue` submits all waiting rows as one transaction and meanwhile collects the next.
 - Effects leave the outbox in the order of their arrival, and none before every `Persist` ahead of it is durable.
 - Any exception of the work is reported like a result: the thread does not end before it is closed.
 """
@@ -40,7 +40,7 @@ class Writer:
         await asyncio.to_thread(self._thread.shutdown)
 
 
-class Outbox:
+class EffectQueue:
     """Outgoing effects in order, with at most one transaction in flight."""
 
     def __init__(

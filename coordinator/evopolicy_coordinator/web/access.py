@@ -129,7 +129,7 @@ class Access:
         return None
 
 
-class Guard:
+class RequestGuard:
     """ASGI middleware: checks every request, and gives every answer its security headers."""
 
     def __init__(self, app: ASGIApp, access: Access) -> None:

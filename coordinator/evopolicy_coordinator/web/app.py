@@ -33,17 +33,17 @@ from evopolicy_common.messages.status import StatusReply
 from evopolicy_common.regular_files import Confined, NotThereError
 from evopolicy_common.wire.credentials import Credentials
 from evopolicy_common.wire.http import bound, serving
-from evopolicy_coordinator.web.access import Access, Guard
+from evopolicy_coordinator.web.access import Access, RequestGuard
 from evopolicy_coordinator.web.content import rendering
-from evopolicy_coordinator.web.content.cluster import Cluster
+from evopolicy_coordinator.web.content.cluster import ShownCluster
 from evopolicy_coordinator.web.content.metrics import CONTENT_TYPE, StatusCollector
 from evopolicy_coordinator.web.content.rendering import Words
 from evopolicy_coordinator.web.content.run_detail import IMAGES, Detail
-from evopolicy_coordinator.web.content.run_folders import Reader, RunFacts, Runs
+from evopolicy_coordinator.web.content.run_folders import FolderReader, RunFacts, ShownRuns
 from evopolicy_coordinator.web.views.cluster import cluster_view
 from evopolicy_coordinator.web.views.run import episode_values, file_link, live_run_view, submit_values
 from evopolicy_coordinator.web.views.sweeps import sweeps_view
-from evopolicy_results.html import View
+from evopolicy_results.html import PageView
 
 _FORM_WAIT_S = 10.0
 _SCAN_S = 1.0
@@ -86,17 +86,17 @@ class Site:
         """`credentials` None: no cluster, only folders."""
         self.title = title
         self.access = access
-        self.reader = Reader(roots)
-        self.runs = Runs(shut=None if credentials is not None else frozenset())
+        self.reader = FolderReader(roots)
+        self.runs = ShownRuns(shut=None if credentials is not None else frozenset())
         self.report = None if report is None else Confined(report)
-        self.cluster: Cluster | None = None
+        self.cluster: ShownCluster | None = None
         self._scanned_at = float("-inf")
         self._scanning = asyncio.Lock()
         self._scan_s = 0.0
         self._registry = CollectorRegistry()
         ProcessCollector(registry=self._registry)
         if credentials is not None:
-            cluster = self.cluster = Cluster(credentials)
+            cluster = self.cluster = ShownCluster(credentials)
             self._registry.register(StatusCollector(lambda: cluster.status if cluster.is_known else None))
 
     @contextlib.asynccontextmanager
@@ -130,7 +130,7 @@ class Site:
 
     # ---- views by page ----
 
-    def view_of(self, page: str, words: Words) -> Callable[[], View]:
+    def view_of(self, page: str, words: Words) -> Callable[[], PageView]:
         """The function that makes the parts of a page. NotThereError for an unknown page."""
         cluster = self.cluster
         if page == "runs":
@@ -141,7 +141,7 @@ class Site:
         if kind != "run" or key not in self.runs.by_key:
             raise NotThereError(page)
 
-        def view() -> View:
+        def view() -> PageView:
             run = self.runs.by_key[key]
             retries = () if cluster is None else tuple(cluster.retries.get(run.run, ()))
             return live_run_view(run, self.runs, self.reader, words, retries=retries)
@@ -286,7 +286,7 @@ class Site:
         ]
         refused = {PageError: self._refused, NotThereError: self._refused}
         site = Starlette(routes=routes, exception_handlers={Exception: _failed, **refused})
-        return Guard(GZipMiddleware(site, minimum_size=1000), self.access)
+        return RequestGuard(GZipMiddleware(site, minimum_size=1000), self.access)
 
 
 async def _failed(request: Request, error: Exception) -> Response:

@@ -8,7 +8,7 @@ from statistics import fmean
 import msgspec
 
 from evopolicy_results.reading.environments import by_name, grouped
-from evopolicy_results.reading.records import Run, by_cell
+from evopolicy_results.reading.records import PastRun, by_cell
 
 PHASES = ("agent_s", "queue_s", "rollout_s", "feedback_s", "finalise_s")
 """Phases of a run's wall time, as fields of `Timing`."""
@@ -40,7 +40,7 @@ class TokenUse(msgspec.Struct, frozen=True, kw_only=True):
     """Runs in which the agent's own count differs from the relay's by more than `COUNTS_DIFFER`."""
 
 
-def mean_phases(runs: Iterable[Run]) -> dict[str, dict[str, float]]:
+def mean_phases(runs: Iterable[PastRun]) -> dict[str, dict[str, float]]:
     """By entry, the mean wall time of a run by phase, in seconds; without entries that record none."""
     by_entry = grouped((run for run in runs if not run.is_published), lambda run: run.entry)
     return {
@@ -49,7 +49,7 @@ def mean_phases(runs: Iterable[Run]) -> dict[str, dict[str, float]]:
     }
 
 
-def token_use(runs: Iterable[Run]) -> list[TokenUse]:
+def token_use(runs: Iterable[PastRun]) -> list[TokenUse]:
     """Every (environment, entry) that was played, environments in catalogue order, entries by name."""
     out: list[TokenUse] = []
     for (env, entry), several in by_cell(runs).items():

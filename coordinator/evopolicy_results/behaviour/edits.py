@@ -28,7 +28,7 @@ import msgspec
 from evopolicy_common import catalogue
 from evopolicy_results.code.topology import Features
 from evopolicy_results.reading.environments import by_name
-from evopolicy_results.reading.records import EditType, Run, Submit
+from evopolicy_results.reading.records import EditType, PastRun, PastSubmit
 
 RATED: tuple[EditType, ...] = ("synthesis", "parametric")
 """The edit types that have a hit rate; the others are candidate management."""
@@ -91,11 +91,11 @@ class EditRates(msgspec.Struct, frozen=True, kw_only=True):
         return self.hits_parametric / self.n_parametric if self.n_parametric else None
 
 
-def classify(submits: Sequence[Submit]) -> list[Transition]:
+def classify(submits: Sequence[PastSubmit]) -> list[Transition]:
     """One record for every score-bearing submit of a run, in order; the first has edit type `first`."""
     out: list[Transition] = []
     by_topology: dict[str, int] = {}
-    previous: Submit | None = None
+    previous: PastSubmit | None = None
     best = float("-inf")
     skipped = False
     for submit in submits:
@@ -131,7 +131,7 @@ def classify(submits: Sequence[Submit]) -> list[Transition]:
     return out
 
 
-def _edit(previous: Submit | None, submit: Submit, by_topology: Mapping[str, int]) -> EditType:
+def _edit(previous: PastSubmit | None, submit: PastSubmit, by_topology: Mapping[str, int]) -> EditType:
     assert submit.source is not None
     if previous is None or previous.source is None:
         return "first"
@@ -143,7 +143,7 @@ def _edit(previous: Submit | None, submit: Submit, by_topology: Mapping[str, int
     return "rollback" if submit.source.topology in by_topology else "synthesis"
 
 
-def edit_rates(runs: Iterable[Run]) -> list[EditRates]:
+def edit_rates(runs: Iterable[PastRun]) -> list[EditRates]:
     """Rows by entry (sorted) and demand group, with `all` last in each entry. Counts are pooled over runs."""
     counts: dict[tuple[str, str], Counter[str]] = defaultdict(Counter)
     for run in runs:
@@ -242,7 +242,7 @@ class EditSizeBin(msgspec.Struct, frozen=True, kw_only=True):
         return self.validation_improved / self.n if self.n else None
 
 
-def structure_means(runs: Sequence[Run]) -> list[StructureMean]:
+def structure_means(runs: Sequence[PastRun]) -> list[StructureMean]:
     """Rows by demand group (`all` last, over every environment), then entry."""
     harness = {run.entry: run.harness for run in runs}
     groups: dict[tuple[str, str], dict[str, list[Features]]] = {}
@@ -269,7 +269,7 @@ def structure_means(runs: Sequence[Run]) -> list[StructureMean]:
     ]
 
 
-def edit_size_bins(runs: Iterable[Run]) -> list[EditSizeBin]:
+def edit_size_bins(runs: Iterable[PastRun]) -> list[EditSizeBin]:
     """Every transition with a known edit size, by entry (sorted) and bin (all bins, including empty ones)."""
     by_entry: dict[str, dict[str, list[Transition]]] = {}
     for run in runs:

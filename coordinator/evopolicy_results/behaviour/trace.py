@@ -19,7 +19,7 @@ from evopolicy_common.regular_files import read_regular
 from evopolicy_results.behaviour.edits import Transition, classify
 from evopolicy_results.code.sources import read_python_files, unified
 from evopolicy_results.reading.agent_log import Evidence, LogReading, read_agent_log
-from evopolicy_results.reading.records import Run, Submit
+from evopolicy_results.reading.records import PastRun, PastSubmit
 
 IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".gif", ".webp"})
 MAX_IMAGE_BYTES = 4 << 20
@@ -42,7 +42,7 @@ class FileDiff(msgspec.Struct, frozen=True, kw_only=True):
 class Trace(msgspec.Struct, frozen=True, kw_only=True):
     """A run's log and files by submit index, where there is anything of the submit."""
 
-    run: Run
+    run: PastRun
     transitions: Mapping[int, Transition]
     """Of the submits with a score, in their order."""
     evidence: Mapping[int, Evidence]
@@ -56,7 +56,7 @@ class Trace(msgspec.Struct, frozen=True, kw_only=True):
     """Messages of the agent that belong to no known submit."""
 
 
-def trace(run: Run) -> Trace:
+def trace(run: PastRun) -> Trace:
     """Reads the run's log and finds its images."""
     log = run.record.artifacts.logs_agent
     reading = read_agent_log(run.path / log, run.submits) if log else LogReading()
@@ -78,7 +78,7 @@ def trace(run: Run) -> Trace:
     )
 
 
-def sources(run: Run, submit: Submit) -> dict[str, str]:
+def sources(run: PastRun, submit: PastSubmit) -> dict[str, str]:
     """Text of a checkpoint's source bundle by path, `policy.py` first; all its Python files if it has no bundle."""
     system = run.checkpoint(submit.index)
     try:
@@ -105,7 +105,7 @@ def diff(before: Mapping[str, str], after: Mapping[str, str]) -> list[FileDiff]:
     return out
 
 
-def _images(run: Run, reading: LogReading) -> dict[int, list[Path]]:
+def _images(run: PastRun, reading: LogReading) -> dict[int, list[Path]]:
     """Images by submit index: new in that checkpoint's `system/`, or in the final workspace and named in its part of
     the log. Workspace images without a name in the log are shown with the last submit."""
     named = {

@@ -29,7 +29,7 @@ from evopolicy_results.publish import rules
 from evopolicy_results.publish.archive import Archive
 from evopolicy_results.publish.collect import Published, Publisher, find_runs, needles_of_this_machine
 from evopolicy_results.publish.contents import Listed
-from evopolicy_results.publish.findings import KINDS, Checked
+from evopolicy_results.publish.findings import KINDS, Findings
 
 FAILED, NOT_REPLAYED = 1, 3
 _SHOWN = 20
@@ -176,7 +176,7 @@ def check(
     raise typer.Exit(FAILED if checked.failed else 0 if replayed else NOT_REPLAYED)
 
 
-async def _replay(archive: Archive, checked: Checked, share: float) -> None:
+async def _replay(archive: Archive, checked: Findings, share: float) -> None:
     end_on_sigterm()
     with terminal(stderr=True).status("replay") as status:
 
@@ -186,7 +186,7 @@ async def _replay(archive: Archive, checked: Checked, share: float) -> None:
         await replays.replay(archive, checked, share, tell)
 
 
-def _print(checked: Checked) -> None:
+def _print(checked: Findings) -> None:
     """One page: a line for each kind that is `ok`, and one for each text of the others."""
     marks = {"ok": "ok    ", "open": "open  ", "failed": "FAILED"}
     grouped = checked.grouped()

@@ -25,7 +25,7 @@ from evopolicy_common.records.rescores import is_name
 from evopolicy_common.records.run_files import no_run_below, run_folders
 from evopolicy_common.terminal import number, one_line, say, say_json
 from evopolicy_results.cli.cluster import Local, Runs, State, Where
-from evopolicy_results.rescore.play import Finished, Wanted, Written, read_finished
+from evopolicy_results.rescore.play import RunToRescore, Wanted, Written, read_finished
 from evopolicy_results.rescore.play import rescore as rescore_run
 
 PARTIAL = 3
@@ -138,7 +138,7 @@ def rescore(
         say(f"next: evopolicy report {' '.join(map(str, runs))} --scores {chosen} --out report")
 
 
-def _packages(runs: list[Finished]) -> tuple[str, ...]:
+def _packages(runs: list[RunToRescore]) -> tuple[str, ...]:
     """Packages besides numpy that the runs' policies import. Raises ConfigError where they differ, since a cluster
     offers one set of packages."""
     packages = {packages_in(run.record.versions.fingerprint): run.folder for run in runs}

@@ -15,7 +15,7 @@ _MAX_POINTS = 600
 """Of one line: more than that a screen cannot show."""
 
 
-class Line(NamedTuple):
+class ChartLine(NamedTuple):
     """One line: points in order of x; a point whose y is no finite number makes a gap."""
 
     name: str
@@ -30,7 +30,7 @@ class Line(NamedTuple):
 def chart(
     title: str,
     x_title: str,
-    lines: Sequence[Line],
+    lines: Sequence[ChartLine],
     *,
     height: float = 180.0,
     x_max: float | None = None,
@@ -101,7 +101,7 @@ def chart(
     return "".join(out)
 
 
-def _legend(lines: Sequence[Line], reference: tuple[str, float] | None) -> str:
+def _legend(lines: Sequence[ChartLine], reference: tuple[str, float] | None) -> str:
     strokes = []
     for place, line in enumerate(lines):
         colour, dash = _stroke(place, line)
@@ -116,14 +116,14 @@ def _legend(lines: Sequence[Line], reference: tuple[str, float] | None) -> str:
     return f'<ul class="legend">{"".join(items)}</ul>'
 
 
-def _stroke(place: int, line: Line) -> tuple[str, str]:
+def _stroke(place: int, line: ChartLine) -> tuple[str, str]:
     """Colour and dash."""
     if line.colour:
         return line.colour, _DASHES[1] if line.steps else ""
     return COLOURS[place % len(COLOURS)], _DASHES[place // len(COLOURS) % len(_DASHES)]
 
 
-def _path(line: Line, x: Callable[[float], float], y: Callable[[float], float]) -> str:
+def _path(line: ChartLine, x: Callable[[float], float], y: Callable[[float], float]) -> str:
     out, pen = "", False
     for px, py in line.points:
         if math.isfinite(py):

@@ -27,7 +27,7 @@ from evopolicy_results.scoring.evolution import Evolution, best_at
 from evopolicy_results.scoring.scores import DEMANDS, scales_of
 from evopolicy_results.statistics.aggregates import TAUS, Bounded
 from evopolicy_results.studies.palette import REFERENCE, Look
-from evopolicy_results.studies.study import Study, Suite
+from evopolicy_results.studies.study import Study, SuiteStudy
 
 _LEFT = -1.0
 """Least end of the overview's scale."""
@@ -97,7 +97,7 @@ def overview(study: Study, looks: Mapping[str, Look]) -> Plot | None:
     )
 
 
-def rank_scores(suite: Suite, study: Study, looks: Mapping[str, Look]) -> Plot | None:
+def rank_scores(suite: SuiteStudy, study: Study, looks: Mapping[str, Look]) -> Plot | None:
     """Suite and family rank scores, one panel each, agents from best to worst."""
     standings, estimates = suite.board.standings, suite.statistics.standings
     if not any(row.score is not None for row in standings):
@@ -137,7 +137,7 @@ def rank_scores(suite: Suite, study: Study, looks: Mapping[str, Look]) -> Plot |
     )
 
 
-def score_evolution(suite: Suite, study: Study, looks: Mapping[str, Look]) -> Plot | None:
+def score_evolution(suite: SuiteStudy, study: Study, looks: Mapping[str, Look]) -> Plot | None:
     """Small multiples, one per environment: best validation mean over consumed episodes, one step curve per run."""
     curves = [one for one in study.evolutions if one.env in suite.table.environments and one.steps]
     by_env = grouped(curves, lambda one: one.env)
@@ -174,7 +174,7 @@ def score_evolution(suite: Suite, study: Study, looks: Mapping[str, Look]) -> Pl
 
 
 def _evolution_panel(
-    panel: Axes, env: str, curves: Sequence[Evolution], suite: Suite, looks: Mapping[str, Look]
+    panel: Axes, env: str, curves: Sequence[Evolution], suite: SuiteStudy, looks: Mapping[str, Look]
 ) -> None:
     panel.set_title(title_of(env))
     for entry, own in grouped(curves, lambda one: one.entry).items():
@@ -221,7 +221,7 @@ def _mean_curve(panel: Axes, curves: Sequence[Evolution], look: Look) -> None:
     )  # fmt: skip
 
 
-def performance_profiles(suite: Suite, study: Study, looks: Mapping[str, Look]) -> Plot | None:
+def performance_profiles(suite: SuiteStudy, study: Study, looks: Mapping[str, Look]) -> Plot | None:
     """By agent, the share of its runs above each normalised score, with a pointwise 95 % band."""
     aggregates = suite.statistics.aggregates
     if not aggregates:
@@ -260,7 +260,7 @@ def _ends(estimate: Estimate | Bounded) -> tuple[float, float]:
     return estimate.low, estimate.high
 
 
-def normalised_performance(suite: Suite, study: Study, looks: Mapping[str, Look]) -> Plot | None:
+def normalised_performance(suite: SuiteStudy, study: Study, looks: Mapping[str, Look]) -> Plot | None:
     """Two panels, one per demand group: each agent's mean as a bar, its environments as dots."""
     agents = suite.table.agents
     groups = {(g.demand, g.entry): g for g in suite.normalised.groups if g.value is not None}

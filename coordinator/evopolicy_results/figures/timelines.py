@@ -13,7 +13,7 @@ from evopolicy_common.terminal import one_line
 from evopolicy_results.behaviour.edits import Transition, classify, events_of, phases
 from evopolicy_results.figures.plot import INK, MUTED, Plot
 from evopolicy_results.reading.environments import title_of
-from evopolicy_results.reading.records import Run, Submit, rows
+from evopolicy_results.reading.records import PastRun, PastSubmit, rows
 from evopolicy_results.studies.palette import EDIT_COLOURS, Look
 
 MAX_ROWS = 24
@@ -43,18 +43,18 @@ _HATCH = (
 )
 
 
-class Row(msgspec.Struct, frozen=True, kw_only=True):
+class RunBand(msgspec.Struct, frozen=True, kw_only=True):
     """One run's band and marks."""
 
     transitions: Sequence[Transition]
     budget: int
     label: str = ""
     look: Look | None = None
-    submits: Sequence[Submit] = ()
+    submits: Sequence[PastSubmit] = ()
     """All submits: they are named above the band, and those without a score are marked too."""
 
 
-def timeline_of(env: str, runs: Iterable[Run], looks: Mapping[str, Look]) -> Plot | None:
+def timeline_of(env: str, runs: Iterable[PastRun], looks: Mapping[str, Look]) -> Plot | None:
     """One environment's runs, one row each."""
     drawn = [(run, transitions) for run in runs if (transitions := classify(run.submits))]
     if not drawn:
@@ -68,7 +68,7 @@ def timeline_of(env: str, runs: Iterable[Run], looks: Mapping[str, Look]) -> Plo
         about = {"run": run.name, "entry": entry, "env": env, "repeat": repeat, "budget": budget}
         data.append({**about, "transitions": rows(transitions)})
         label = f"{entry} #{repeat}" if repeat else entry
-        lines.append(Row(transitions=transitions, budget=budget, label=label, look=looks[entry]))
+        lines.append(RunBand(transitions=transitions, budget=budget, label=label, look=looks[entry]))
     return Plot(
         name=f"timeline_{folder_name(env)}",
         title=f"{title_of(env)} code phases",
@@ -81,7 +81,7 @@ def timeline_of(env: str, runs: Iterable[Run], looks: Mapping[str, Look]) -> Plo
     )
 
 
-def timeline_svg(runs: Sequence[Row]) -> str:
+def timeline_svg(runs: Sequence[RunBand]) -> str:
     """A legend, a row for each run, and the axis of the budget."""
     labels = [one_line(run.label)[:_MAX_LABEL] for run in runs]
     left = 14.0 + max((_LETTER * len(label) + 20.0 for label in labels if label), default=0.0)
@@ -120,7 +120,7 @@ def timeline_svg(runs: Sequence[Row]) -> str:
     return "".join(out)
 
 
-def _row(run: Row, top: float, left: float, scale: float) -> list[str]:
+def _row(run: RunBand, top: float, left: float, scale: float) -> list[str]:
     out: list[str] = []
     for start, end, edit in phases(run.transitions):
         fill = "url(#parametric)" if edit == "parametric" else EDIT_COLOURS[edit]
@@ -151,7 +151,7 @@ def _mark(kind: str, x: float, top: float, title: str) -> str:
     return f'<use href="#{kind}" x="{x:.1f}" y="{y:g}">{title}</use>'
 
 
-def _legend(runs: Sequence[Row]) -> str:
+def _legend(runs: Sequence[RunBand]) -> str:
     edits = {edit for run in runs for _, _, edit in phases(run.transitions)}
     kinds = {kind for run in runs for transition in run.transitions for kind in events_of(transition)}
     if any(len(run.submits) > len(run.transitions) for run in runs):

@@ -62,7 +62,7 @@ def part(name: str, /, **values: object) -> str:
     return str(getattr(environment().get_template("run_parts.html.j2").module, name)(**values))
 
 
-class View:
+class PageView:
     """A page's content at one moment. Every part's HTML is one element whose id is the part's name."""
 
     def __init__(self, *lists: str) -> None:
@@ -83,10 +83,12 @@ class View:
         return [*self.lists, *(name for name in self.parts if name not in listed)]
 
 
-def page(template: str, *, view: View | None = None, own: Environment | None = None, **values: object) -> str:
+def page(
+    template: str, *, view: PageView | None = None, own: Environment | None = None, **values: object
+) -> str:
     """A page from the template of that name. In it `part(name)` and `listed(name)` put the view's parts, where it has
     them. `own`: the environment, unless it is the report's."""
-    shown = view or View()
+    shown = view or PageView()
 
     def one(name: str) -> Markup:
         return Markup(shown.parts.get(name, ""))

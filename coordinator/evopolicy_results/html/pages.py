@@ -18,7 +18,7 @@ from evopolicy_results.figures.plot import Plot
 from evopolicy_results.html import Notice, page, section, visible
 from evopolicy_results.html.run_page import run_view
 from evopolicy_results.reading.environments import grouped, title_of
-from evopolicy_results.reading.records import Run
+from evopolicy_results.reading.records import PastRun
 from evopolicy_results.studies.answers import answers_of
 from evopolicy_results.studies.palette import Look
 from evopolicy_results.studies.study import Study
@@ -176,7 +176,7 @@ def _cell(column: Column, value: object, mark: int, page_of_run: str | None, tex
     }
 
 
-def run_title(run: Run) -> str:
+def run_title(run: PastRun) -> str:
     return f"{run.entry} on {title_of(run.env)}, {run.record.exp_id}"
 
 
@@ -251,7 +251,7 @@ def _checkpoints(trace: Trace) -> dict[str, dict[str, object]]:
 class PlayedEpisode(NamedTuple):
     """A recorded episode of one run, with the parts of it that were copied into the report."""
 
-    run: Run
+    run: PastRun
     replay: Replay
     video: str | None
     """Path of the copy, relative to the page; None when the recording is missing."""

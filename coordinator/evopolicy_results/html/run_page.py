@@ -10,20 +10,20 @@ from markupsafe import Markup
 
 from evopolicy_results.behaviour.edits import Transition
 from evopolicy_results.behaviour.trace import Trace
-from evopolicy_results.figures.line_chart import Line, chart
+from evopolicy_results.figures.line_chart import ChartLine, chart
 from evopolicy_results.figures.plot import inline_svg
-from evopolicy_results.figures.timelines import Row, timeline_svg
-from evopolicy_results.html import Notice, View, part
+from evopolicy_results.figures.timelines import RunBand, timeline_svg
+from evopolicy_results.html import Notice, PageView, part
 from evopolicy_results.reading.agent_log import Evidence
 from evopolicy_results.reading.environments import title_of
-from evopolicy_results.reading.records import Submit
+from evopolicy_results.reading.records import PastSubmit
 from evopolicy_results.studies.palette import Look
 
 MAX_SUBMITS = 200
 """Submits that a page of the live view lists, the newest."""
 
 
-def _change(submit: Submit, transition: Transition | None) -> str:
+def _change(submit: PastSubmit, transition: Transition | None) -> str:
     lines = submit.changed_lines
     changed = "" if lines is None else f"{lines} line{'' if lines == 1 else 's'} changed"
     if transition is not None and transition.edit == "rollback":
@@ -32,7 +32,7 @@ def _change(submit: Submit, transition: Transition | None) -> str:
     return texts.get("" if transition is None else transition.edit, changed)
 
 
-def _outcome(submit: Submit, transition: Transition | None, by_index: Mapping[int, Submit]) -> str:
+def _outcome(submit: PastSubmit, transition: Transition | None, by_index: Mapping[int, PastSubmit]) -> str:
     """Its hidden results in words; empty without any."""
     value = submit.val_mean
     if value is None:
@@ -46,11 +46,11 @@ def _outcome(submit: Submit, transition: Transition | None, by_index: Mapping[in
 
 
 def run_view(
-    submits: Sequence[Submit],
+    submits: Sequence[PastSubmit],
     trace: Trace | None = None,
     *,
     may_show: bool = False,
-    href: Callable[[Submit], str],
+    href: Callable[[PastSubmit], str],
     images: Mapping[int, Sequence[tuple[str, str]]] | None = None,
     videos: Mapping[int, str] | None = None,
     entry: str,
@@ -62,7 +62,7 @@ def run_view(
     reference: tuple[str, float] | None = None,
     is_finished: bool = True,
     lists: Sequence[str] = (),
-) -> View:
+) -> PageView:
     """The parts that the page has in a report and in the live view.
 
     `trace`: of a run that a report can read; `may_show`: whether its hidden results may be shown. `href`: the address
@@ -70,7 +70,7 @@ def run_view(
     `lists`: of further parts.
     """
     transitions = {} if trace is None else trace.transitions
-    view = View("submit-rows", *lists)
+    view = PageView("submit-rows", *lists)
     view.parts |= {
         "look": part("identity", entry=entry, look=look, env_title=title_of(env)),
         "facts": part("facts", facts=facts),
@@ -85,7 +85,7 @@ def run_view(
         ),
     }
     if may_show and transitions:
-        phases = Row(transitions=list(transitions.values()), budget=budget, submits=submits)
+        phases = RunBand(transitions=list(transitions.values()), budget=budget, submits=submits)
         label = f"Code phases of {len(submits)} submits over {budget} episodes"
         view.parts["phases"] = part(
             "figure",
@@ -123,13 +123,15 @@ def run_view(
     return view
 
 
-def _curve(submits: Sequence[Submit], budget: int, reference: tuple[str, float] | None, colour: str) -> str:
+def _curve(
+    submits: Sequence[PastSubmit], budget: int, reference: tuple[str, float] | None, colour: str
+) -> str:
     points = [(float(one.consumed), one.mean_return) for one in submits if one.mean_return is not None]
     best = itertools.accumulate((mean for _, mean in points), max)
     rising = [(at, mean) for (at, _), mean in zip(points, best, strict=True)]
     lines = [
-        Line("mean train return", points, dots=True, colour=colour),
-        Line("best so far", rising, steps=True, colour=colour),
+        ChartLine("mean train return", points, dots=True, colour=colour),
+        ChartLine("best so far", rising, steps=True, colour=colour),
     ]
     return chart(
         "Train returns over budget",

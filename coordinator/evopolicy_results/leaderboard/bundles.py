@@ -26,16 +26,16 @@ from evopolicy_common.records.policies.checkpoints import CheckpointMeta
 from evopolicy_common.records.run_record import Artifacts, encode_run_record
 from evopolicy_results.publish import contents, rules, run_rules
 from evopolicy_results.publish.archive import Archive
-from evopolicy_results.publish.contents import Episode
-from evopolicy_results.publish.findings import Checked, PublishedRun
+from evopolicy_results.publish.contents import PublishedEpisode
+from evopolicy_results.publish.findings import Findings, PublishedRun
 from evopolicy_results.reading.comparability import mixtures
 from evopolicy_results.reading.reader import load_runs
-from evopolicy_results.reading.records import LeftOut, Run
+from evopolicy_results.reading.records import LeftOut, PastRun
 
 _MAX_NAME = 120
 _POINTS = 160
 
-Replay = Callable[[Archive, Checked], None]
+Replay = Callable[[Archive, Findings], None]
 """Replays recorded actions and adds the findings."""
 
 
@@ -49,9 +49,9 @@ class LabBundle(msgspec.Struct, kw_only=True):
     """Position among the files of the site."""
     lab: str = ""
     """Name that the site's owner gives the signer; empty for none."""
-    checked: Checked = msgspec.field(default_factory=Checked)
-    runs: list[Run] = []
-    episodes: dict[str, tuple[tuple[Episode, tuple[float, ...]], ...]] = {}
+    checked: Findings = msgspec.field(default_factory=Findings)
+    runs: list[PastRun] = []
+    episodes: dict[str, tuple[tuple[PublishedEpisode, tuple[float, ...]], ...]] = {}
     """By the coordinator's id of a run: held-out episodes of the selected checkpoint, each with the sum of its rewards
     so far at `_POINTS` steps at most; without sums where the recording was withheld."""
     left_out: list[LeftOut] = []
@@ -61,7 +61,7 @@ class LabBundle(msgspec.Struct, kw_only=True):
     heads: list[str] = []
     """Of its journal, after each entry."""
 
-    def runs_of(self, unrecorded: bool) -> list[Run]:
+    def runs_of(self, unrecorded: bool) -> list[PastRun]:
         """Its runs that have episodes without a recording, or the others."""
         return [run for run in self.runs if bool(self.checked.unrecorded(run.record.run)) == unrecorded]
 
@@ -115,7 +115,7 @@ def read_bundles(
     return bundles
 
 
-def _refusal(checked: Checked, seen: Mapping[tuple[str, str], str]) -> str:
+def _refusal(checked: Findings, seen: Mapping[tuple[str, str], str]) -> str:
     """Why a file is not shown; empty if it is. `seen`: the file of each signer's runs."""
     failed = [f"{each.kind}: {each.text}" for each in checked.findings if each.state == "failed"]
     runs = [run.opening.run for run in checked.runs]
@@ -177,7 +177,7 @@ def _unpack(archive: Archive, run: PublishedRun, place: Path) -> None:
         checkpoints.write(folder, meta, bundle, checkpoints.measured(bundle))
 
 
-def _curves(archive: Archive, run: PublishedRun) -> tuple[tuple[Episode, tuple[float, ...]], ...]:
+def _curves(archive: Archive, run: PublishedRun) -> tuple[tuple[PublishedEpisode, tuple[float, ...]], ...]:
     place = ("heldout", run.result.best_submit_index)
     episodes = []
     for group in (each for each in run.groups if (each.split, each.submit_index) == place):
@@ -231,7 +231,7 @@ def _tell_apart(bundles: Sequence[LabBundle]) -> None:
             seen.add(each.name)
 
 
-def _with(run: Run, **changes: object) -> Run:
+def _with(run: PastRun, **changes: object) -> PastRun:
     """The run with other fields of its `run.json`."""
     return msgspec.structs.replace(run, record=msgspec.structs.replace(run.record, **changes))
 
@@ -266,11 +266,11 @@ class Board(msgspec.Struct, kw_only=True):
     """Its runs have episodes without a recording, so that no replay can contradict their returns."""
 
     @property
-    def runs(self) -> list[Run]:
+    def runs(self) -> list[PastRun]:
         return [run for bundle in self.bundles for run in bundle.runs]
 
     @property
-    def compared(self) -> list[Run]:
+    def compared(self) -> list[PastRun]:
         """Those that a leaderboard ranks: not the ones that start from a submit of another run."""
         return [run for run in self.runs if run.record.start is None]
 

@@ -19,7 +19,7 @@ from evopolicy_common.processes.preflight import check_writable
 from evopolicy_common.processes.scratch import scratch_folder
 from evopolicy_common.terminal import one_line, say
 from evopolicy_results.publish.archive import Archive
-from evopolicy_results.publish.findings import Checked
+from evopolicy_results.publish.findings import Findings
 from evopolicy_results.publish.replay import replay as replayed
 from evopolicy_results.publish.replay import share_of
 
@@ -78,7 +78,7 @@ def leaderboard(
         share = share_of("--replay", replay)
         check_writable(out, "--out")
 
-        def replay_share(archive: Archive, checked: Checked) -> None:
+        def replay_share(archive: Archive, checked: Findings) -> None:
             if share is not None:
                 asyncio.run(replayed(archive, checked, share, lambda played, total: None))
 

@@ -23,7 +23,7 @@ from evopolicy_results.html.pages import table_view
 from evopolicy_results.leaderboard.bundles import Board, LabBundle, boards
 from evopolicy_results.publish.findings import KINDS
 from evopolicy_results.reading.environments import title_of
-from evopolicy_results.reading.records import Run
+from evopolicy_results.reading.records import PastRun
 from evopolicy_results.report import check_folder, slug, write_file, write_report
 from evopolicy_results.studies.palette import looks
 from evopolicy_results.studies.study import Study, study_of
@@ -38,12 +38,12 @@ _WORDS = {"ok": "ok", "open": "open", "failed": "FAILED", "": "–"}
 Tell = Callable[[str], None]
 
 
-class Link(NamedTuple):
+class HtmlLink(NamedTuple):
     text: str
     href: str
 
 
-Cell = str | int | float | Link
+CellValue = str | int | float | HtmlLink
 
 
 def write_site(
@@ -81,7 +81,7 @@ def _write_pages(bundles: Sequence[LabBundle], out: Path, title: str, tell: Tell
     sections: list[dict[str, object]] = []
     entries: set[str] = set()
     reference: str | None = None
-    runs: list[tuple[Cell, ...]] = []
+    runs: list[tuple[CellValue, ...]] = []
     for number, board in enumerate(all_boards, start=1):
         tell(f"board {number} of {len(all_boards)}: {len(board.runs)} runs")
         study = study_of(board.runs, allow_mixed=True)
@@ -99,14 +99,14 @@ def _write_pages(bundles: Sequence[LabBundle], out: Path, title: str, tell: Tell
                     (
                         *(run.entry, title_of(run.env), run.record.repeat),
                         "–" if run.score is None else run.score,
-                        Link(run.record.exp_id, own),
+                        HtmlLink(run.record.exp_id, own),
                         "usual" if run.record.start is None else run.record.start.text[:_LONG],
-                        Link(f"{n} episodes", episodes) if n else "–",
+                        HtmlLink(f"{n} episodes", episodes) if n else "–",
                         *_named(bundle),
                     )
                 )
     kinds = [kind for kind in KINDS if any(bundle.checked.state_of(kind) for bundle in bundles)]
-    files: list[tuple[Cell, ...]] = []
+    files: list[tuple[CellValue, ...]] = []
     for bundle in bundles:
         checked = bundle.checked
         omitted = sum(each.state != "published" for each in checked.listing)
@@ -210,8 +210,8 @@ _RUNS = (
 )
 
 
-def _named(bundle: LabBundle) -> tuple[Cell, Cell]:
-    return Link(bundle.file, bundle.page), bundle.label
+def _named(bundle: LabBundle) -> tuple[CellValue, CellValue]:
+    return HtmlLink(bundle.file, bundle.page), bundle.label
 
 
 def _bundle_page(bundle: LabBundle) -> str:
@@ -250,7 +250,7 @@ def _bundle_page(bundle: LabBundle) -> str:
     )
 
 
-def _episodes(run: Run, bundle: LabBundle, run_page: str) -> str:
+def _episodes(run: PastRun, bundle: LabBundle, run_page: str) -> str:
     return page(
         "site_episodes",
         title=f"{run.entry} on {title_of(run.env)}",
@@ -302,7 +302,7 @@ def _notices(bundles: Sequence[LabBundle]) -> list[Notice]:
 
 
 def _table(
-    ident: str, title: str, caption: str, columns: str, rows: Sequence[tuple[Cell, ...]]
+    ident: str, title: str, caption: str, columns: str, rows: Sequence[tuple[CellValue, ...]]
 ) -> dict[str, object]:
     """A table for the page; cells that are numbers sort as numbers. `columns`: their titles."""
     cells = [list(map(_cell, row)) for row in rows]
@@ -322,14 +322,16 @@ def _table(
     }
 
 
-def _cell(cell: Cell) -> dict[str, object]:
-    text = cell.text if isinstance(cell, Link) else f"{cell:.4g}" if isinstance(cell, float) else str(cell)
+def _cell(cell: CellValue) -> dict[str, object]:
+    text = (
+        cell.text if isinstance(cell, HtmlLink) else f"{cell:.4g}" if isinstance(cell, float) else str(cell)
+    )
     value = cell if isinstance(cell, int | float) else None
     return {
         "text": text,
         "value": value,
         "cls": "n" if value is not None else "long" if len(text) > _LONG else "",
-        "href": cell.href if isinstance(cell, Link) else None,
+        "href": cell.href if isinstance(cell, HtmlLink) else None,
         "entry": text if isinstance(cell, str) else None,
     }
 

@@ -29,7 +29,7 @@ _LOCAL = struct.Struct("<4sHHHHHIIIHH")
 _FILE_MODE = 0o100644
 
 
-class Writer:
+class ArchiveWriter:
     """Writes files in the order given; the same files give the same bytes."""
 
     def __init__(self, path: Path) -> None:
@@ -46,7 +46,7 @@ class Writer:
 
 
 def _headers(name: bytes, crc: int, size: int, offset: int) -> tuple[bytes, bytes]:
-    """The bytes before a file's content at `offset`, and those in the list at the end, as `Writer` makes them."""
+    """The bytes before a file's content at `offset`, and those in its list, as `ArchiveWriter` makes them."""
     common = (20, 0, 0, 0, 1 << 5 | 1, crc, size, size, len(name), 0)
     entry = _ENTRY.pack(b"PK\1\2", 3 << 8 | 20, *common, 0, 0, 0, _FILE_MODE << 16, offset)
     return _LOCAL.pack(b"PK\3\4", *common) + name, entry + name

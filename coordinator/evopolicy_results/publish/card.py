@@ -60,13 +60,13 @@ _ALWAYS = (
 )
 
 
-class Source(NamedTuple):
+class CardSource(NamedTuple):
     folder: str
     record: RunRecord
     result: RunResult
 
 
-class Cell(msgspec.Struct, frozen=True, kw_only=True):
+class CardCell(msgspec.Struct, frozen=True, kw_only=True):
     """All runs of an entry on an environment from one start."""
 
     entry: str
@@ -121,7 +121,7 @@ class Card(msgspec.Struct, frozen=True, kw_only=True):
     ended: str
     revealed: str
     """When the cases became public, by the coordinator's clock."""
-    results: tuple[Cell, ...]
+    results: tuple[CardCell, ...]
     agents: tuple[AgentCost, ...]
     conditions: dict[str, dict[str, dict[str, int]]]
     """By topic and name: each value, with the number of runs that have it."""
@@ -133,7 +133,7 @@ class Card(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def make(
-    sources: Sequence[Source],
+    sources: Sequence[CardSource],
     lines: Sequence[bytes],
     *,
     signer: str,
@@ -146,8 +146,8 @@ def make(
     entries = [journal.read_entry(line) for line in lines]
     revealed = [each.at for each in entries if isinstance(each, journal.Revealed)]
     records = [each.record for each in sources]
-    cells: dict[tuple[str, str, str], list[Source]] = {}
-    by_entry: dict[str, list[Source]] = {}
+    cells: dict[tuple[str, str, str], list[CardSource]] = {}
+    by_entry: dict[str, list[CardSource]] = {}
     for each in sources:
         cells.setdefault((each.record.env, each.record.agent.entry, _start(each.record)), []).append(each)
         by_entry.setdefault(each.record.agent.entry, []).append(each)
@@ -178,7 +178,7 @@ def _start(record: RunRecord) -> str:
     return "" if record.start is None else record.start.text
 
 
-def _cell(env: str, entry: str, start: str, sources: Sequence[Source]) -> Cell:
+def _cell(env: str, entry: str, start: str, sources: Sequence[CardSource]) -> CardCell:
     """With the interval of reports (`docs/explanation/statistics.md`)."""
     runs = []
     for _, record, result in sources:
@@ -193,7 +193,7 @@ def _cell(env: str, entry: str, start: str, sources: Sequence[Source]) -> Cell:
     outcomes = [each.record.outcome for each in sources]
     measured = [each.score for each in outcomes if each.score is not None]
     random = [each.random_score for each in outcomes if each.random_score is not None]
-    return Cell(
+    return CardCell(
         entry=entry,
         env=env,
         start=start,
@@ -212,7 +212,7 @@ def _over(estimate: Estimate | None, repeated: str) -> str:
     return "; ".join(filter(None, (estimate.reason or estimate.over, repeated)))
 
 
-def _agent(entry: str, sources: Sequence[Source]) -> AgentCost:
+def _agent(entry: str, sources: Sequence[CardSource]) -> AgentCost:
     agents = [each.record.agent for each in sources]
     used = [agent.resources.cpu_s for agent in agents if agent.resources is not None]
     tokens = [agent.tokens for agent in agents if agent.tokens is not None]
@@ -283,7 +283,7 @@ def matching(own: Card, claimed: Card) -> Card:
     return msgspec.structs.replace(own, results=(*cells, *own.results[len(cells) :]))
 
 
-def _nearest(ours: Cell, theirs: Cell) -> Cell:
+def _nearest(ours: CardCell, theirs: CardCell) -> CardCell:
     if ours.low is None or ours.high is None or theirs.low is None or theirs.high is None:
         return ours
     apart = max(abs(ours.low - theirs.low), abs(ours.high - theirs.high))

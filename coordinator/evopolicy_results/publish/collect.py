@@ -39,8 +39,8 @@ from evopolicy_common.wire.operator_client import TIMEOUT_S, OperatorClient
 from evopolicy_common.wire.transport import Link
 from evopolicy_results.publish import card as cards
 from evopolicy_results.publish import contents, descriptions, scrub
-from evopolicy_results.publish.archive import Writer
-from evopolicy_results.publish.contents import Episode, Group, Listed, Manifest, Removed
+from evopolicy_results.publish.archive import ArchiveWriter
+from evopolicy_results.publish.contents import EpisodeGroup, Listed, Manifest, PublishedEpisode, Removed
 
 Tell = Callable[[str], None]
 _SHOWN = 20
@@ -167,9 +167,9 @@ class Publisher:
             where = f" ({', '.join(named[:8])})" if named else ""
             raise ConfigError(f"{error}{where}") from error
         entries = await self._ask.journal()
-        folders_left_out, described = list(left_out), list[cards.Source]()
+        folders_left_out, described = list(left_out), list[cards.CardSource]()
         partial = out.with_name(f".{out.name}.partial")
-        self._writer = Writer(partial)
+        self._writer = ArchiveWriter(partial)
         try:
             for number, source in enumerate(sources):
                 record, before = source.record, len(self._removed)
@@ -217,7 +217,7 @@ class Publisher:
         if card is not None:
             with out.open("rb") as stream:
                 sha256 = hashlib.file_digest(stream, "sha256").hexdigest()
-            file = descriptions.File(out.name, sha256, out.stat().st_size)
+            file = descriptions.ArchiveFile(out.name, sha256, out.stat().st_size)
             for name, data in descriptions.files(made, digests, file).items():
                 (card / name).write_bytes(data)
         listed = contents.listing(map(journal.read_entry, entries), [each.result.run for each in described])
@@ -250,13 +250,13 @@ class Publisher:
     def _leave_out(self, what: str, why: str) -> None:
         self._removed.append(Removed(what=what, why=why))
 
-    async def _add_run(self, source: _Source, place: str) -> cards.Source:
+    async def _add_run(self, source: _Source, place: str) -> cards.CardSource:
         opened = await self._ask.opening(source.record.run)
         result = msgspec.json.decode(opened.result, type=RunResult)
         kept, removed = scrub.record(source.record)
         for each in removed:
             self._leave_out(f"{place}/run.json: {each.what}", each.why)
-        groups: list[Group] = []
+        groups: list[EpisodeGroup] = []
         recorded: dict[str, bytes] = {}
         for split, index, n in contents.wanted_groups(result):
             group, recordings = await self._group(source, split, index, n, place)
@@ -283,11 +283,11 @@ class Publisher:
         own = list(self._written.items())[before:]
         digests = {name.removeprefix(f"{place}/"): digest for name, digest in own}
         self._add(f"{place}/{contents.DIGESTS}", contents.document(digests))
-        return cards.Source(place, decode_run_record(run_json), result)
+        return cards.CardSource(place, decode_run_record(run_json), result)
 
     async def _group(
         self, source: _Source, split: Split, index: int, n: int, place: str
-    ) -> tuple[Group, bytes | None]:
+    ) -> tuple[EpisodeGroup, bytes | None]:
         """A group's returns, and its recordings packed; None where something in them must not be published."""
         run, name = source.record.run, contents.group_name(split, index)
         recorded = self._ask.recorded(run, split, index, timeout_s=TIMEOUT_S)
@@ -300,7 +300,7 @@ class Publisher:
         finds: list[_Secret] = []
         for number, outcome in sorted(outcomes.items()):
             episodes.append(
-                Episode(
+                PublishedEpisode(
                     index=number,
                     episode_return=outcome.episode_return,
                     length=outcome.length,
@@ -315,7 +315,7 @@ class Publisher:
                 finds += self._secrets(f"{place}/actions/{name}/{number}", texts, source.passed)
                 data = actions_only(trajectory)
             recordings.append(data)
-        group = Group(split=split, submit_index=index, episodes=tuple(episodes))
+        group = EpisodeGroup(split=split, submit_index=index, episodes=tuple(episodes))
         if finds:
             self._stop_at(finds)
             self._leave_out(f"run {run}: actions of {name}", f"they held {finds[0].what}")

@@ -77,7 +77,7 @@ class Signature(msgspec.Struct, frozen=True, kw_only=True):
     signature: Word
 
 
-class Episode(msgspec.Struct, frozen=True, kw_only=True):
+class PublishedEpisode(msgspec.Struct, frozen=True, kw_only=True):
     index: Int
     """Position in its group's list."""
     episode_return: Number
@@ -86,13 +86,13 @@ class Episode(msgspec.Struct, frozen=True, kw_only=True):
     """Category of the policy's failure; empty for none."""
 
 
-class Group(msgspec.Struct, frozen=True, kw_only=True):
+class EpisodeGroup(msgspec.Struct, frozen=True, kw_only=True):
     """The episodes of one list of cases."""
 
     split: Split
     submit_index: Int
     """`RANDOM` for the random reference."""
-    episodes: Many[Episode]
+    episodes: Many[PublishedEpisode]
 
     @property
     def name(self) -> str:

@@ -14,7 +14,7 @@ import msgspec
 
 from evopolicy_common.records.run_record import RunSummary
 from evopolicy_results.publish import contents
-from evopolicy_results.publish.card import AgentCost, Card, Cell
+from evopolicy_results.publish.card import AgentCost, Card, CardCell
 
 _SHOWN = 4
 """Values of a condition that the text lists."""
@@ -27,13 +27,13 @@ _KINDS = {
 _DATA_TYPES = {float: "sc:Float", int: "sc:Integer", str: "sc:Text"}
 
 
-class File(NamedTuple):
+class ArchiveFile(NamedTuple):
     name: str
     sha256: str
     size: int
 
 
-def files(card: Card, digests: Mapping[str, str], file: File | None = None) -> dict[str, bytes]:
+def files(card: Card, digests: Mapping[str, str], file: ArchiveFile | None = None) -> dict[str, bytes]:
     """The descriptions by name; `digests` and `file` as in `croissant`."""
     data = contents.document(card)
     description = croissant(card, {**digests, contents.CARD: contents.digest(data)}, file)
@@ -95,7 +95,7 @@ families, as the packages state them (none for toys):
     return "\n".join(lines)
 
 
-def _result(cell: Cell) -> tuple[object, ...]:
+def _result(cell: CardCell) -> tuple[object, ...]:
     interval = "none" if cell.low is None else f"{_number(cell.low)} to {_number(cell.high)}"
     entry = f"{cell.entry}, from {cell.start}" if cell.start else cell.entry
     return cell.env, entry, cell.runs, _number(cell.mean), interval, cell.over, _number(cell.random)
@@ -131,7 +131,7 @@ def _values(values: Mapping[str, int], n_runs: int) -> str:
     return ", ".join(f"{value} ({n})" if n < n_runs else value for value, n in listed[:_SHOWN]) + more
 
 
-def croissant(card: Card, digests: Mapping[str, str], file: File | None = None) -> dict[str, object]:
+def croissant(card: Card, digests: Mapping[str, str], file: ArchiveFile | None = None) -> dict[str, object]:
     """`croissant.json`. `digests`: of the published files, by name. `file`: describes them as contained in
     it; else as they are beside the description when it is unpacked."""
     contained = {} if file is None else {"containedIn": {"@id": file.name}}

@@ -17,7 +17,7 @@ from evopolicy_common.records.policies import bundles
 from evopolicy_common.records.policies.bundles import Bundle
 from evopolicy_common.records.run_record import RunRecord
 from evopolicy_results.publish import contents, fields
-from evopolicy_results.publish.contents import Group, Listed, Removed
+from evopolicy_results.publish.contents import EpisodeGroup, Listed, Removed
 
 T = TypeVar("T")
 OfRun = TypeVar("OfRun", journal.Opened, journal.Ended)
@@ -63,7 +63,7 @@ class Finding(msgspec.Struct, frozen=True, kw_only=True):
     """The run it is of; empty for the whole."""
 
 
-class Files(Protocol):
+class FileSet(Protocol):
     @property
     def names(self) -> frozenset[str]: ...
 
@@ -79,7 +79,7 @@ class PublishedRun(msgspec.Struct, frozen=True, kw_only=True):
     opening: Opening
     salt: bytes
     result: RunResult
-    groups: tuple[Group, ...]
+    groups: tuple[EpisodeGroup, ...]
     opening_bytes: bytes
     result_bytes: bytes
     as_written: dict[str, Any]
@@ -87,7 +87,7 @@ class PublishedRun(msgspec.Struct, frozen=True, kw_only=True):
     def cases(self, split: Split) -> tuple[Case, ...]:
         return self.opening.cases(split)
 
-    def recordings(self, files: Files, group: str) -> list[bytes | None]:
+    def recordings(self, files: FileSet, group: str) -> list[bytes | None]:
         """The packed recordings of a group's episodes, by its name; empty without any. ProtocolError for damaged
         ones."""
         path = f"{self.folder}/actions/{group}"
@@ -95,7 +95,7 @@ class PublishedRun(msgspec.Struct, frozen=True, kw_only=True):
             return []
         return contents.unpack_recordings(files.read_file(path, contents.MAX_RECORDING_BYTES))
 
-    def policies(self, files: Files, damaged: Collection[str] = ()) -> Iterator[tuple[int, Bundle | str]]:
+    def policies(self, files: FileSet, damaged: Collection[str] = ()) -> Iterator[tuple[int, Bundle | str]]:
         """By index of each submit with a policy: the published policy, or why there is none; empty where it was
         withheld or is `damaged`."""
         for submit in self.result.submits:
@@ -111,12 +111,12 @@ class PublishedRun(msgspec.Struct, frozen=True, kw_only=True):
             if submit.bundle:
                 yield submit.submit_index, policy
 
-    def bundles(self, files: Files) -> dict[int, Bundle]:
+    def bundles(self, files: FileSet) -> dict[int, Bundle]:
         """The published policies by submit index."""
         return {index: each for index, each in self.policies(files) if not isinstance(each, str)}
 
 
-class Checked(msgspec.Struct, kw_only=True):
+class Findings(msgspec.Struct, kw_only=True):
     signer: str = ""
     """Public key, hexadecimal; empty without a valid signature."""
     findings: list[Finding] = []
@@ -127,7 +127,7 @@ class Checked(msgspec.Struct, kw_only=True):
     claims: dict[str, list[str]] = {}
     """Fields that nobody can check, by file (`fields`)."""
     recorded: dict[str, dict[str, tuple[int, int]]] = {}
-    """By run and `Group.part`: the episodes that have a recording, and all."""
+    """By run and `EpisodeGroup.part`: the episodes that have a recording, and all."""
     covered: dict[str, int] = {}
     """By part, the episodes that a replay played."""
 
@@ -185,7 +185,7 @@ class Checked(msgspec.Struct, kw_only=True):
         self.claim(name, claims)
 
 
-class Fault(NamedTuple):
+class DocumentFault(NamedTuple):
     kind: str
     text: str
 

@@ -26,8 +26,8 @@ from evopolicy_common.records.episodes.trajectory import Trajectory
 from evopolicy_common.records.splits import FILE_STEMS, SPLITS, SplitFile, cases_hash
 from evopolicy_common.wire import credentials, transport
 from evopolicy_results.evaluations import Cases, Evaluations, Origin, sample, unlike
-from evopolicy_results.publish.contents import Group
-from evopolicy_results.publish.findings import Checked, Files, PublishedRun, State
+from evopolicy_results.publish.contents import EpisodeGroup
+from evopolicy_results.publish.findings import FileSet, Findings, PublishedRun, State
 from evopolicy_results.publish.run_rules import recording_of
 
 LAST_PLACES = 4
@@ -41,12 +41,12 @@ class Chosen(msgspec.Struct, frozen=True):
     """Episodes of one group that are played."""
 
     run: PublishedRun
-    group: Group
+    group: EpisodeGroup
     cases: Cases
     indexes: tuple[int, ...]
 
 
-async def replay(files: Files, checked: Checked, share: float, tell: Tell) -> None:
+async def replay(files: FileSet, checked: Findings, share: float, tell: Tell) -> None:
     """Plays a share of all recorded episodes, drawn at random, and adds the findings to `checked`. Runs are played on
     as many clusters, one after another, as their cases ask for."""
     chosen = draw(checked.runs, share)
@@ -91,7 +91,11 @@ async def replay(files: Files, checked: Checked, share: float, tell: Tell) -> No
 
 
 async def _replay(
-    files: Files, checked: Checked, evaluations: Evaluations, parts: Sequence[Chosen], other_cpu: bool
+    files: FileSet,
+    checked: Findings,
+    evaluations: Evaluations,
+    parts: Sequence[Chosen],
+    other_cpu: bool,
 ) -> None:
     """Plays the chosen episodes of one run. `other_cpu`: this processor has other features than the run's."""
     name, played, alike = parts[0].run.opening.run, 0, True
@@ -120,7 +124,7 @@ async def _replay(
         checked.add("replay", "open" if missing else "ok", text, name)
 
 
-def _recorded(files: Files, part: Chosen) -> dict[int, bytes]:
+def _recorded(files: FileSet, part: Chosen) -> dict[int, bytes]:
     """The recordings of the chosen episodes, by index."""
     recorded: dict[int, bytes] = {}
     with contextlib.suppress(ProtocolError):  # reported by the check of recordings

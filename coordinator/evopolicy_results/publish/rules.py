@@ -26,18 +26,18 @@ from evopolicy_results.publish.contents import (
     Signature,
     signed_by,
 )
-from evopolicy_results.publish.findings import KINDS, UPDATE, Checked, Files, History, State, decoded
+from evopolicy_results.publish.findings import KINDS, UPDATE, FileSet, Findings, History, State, decoded
 from evopolicy_results.publish.run_rules import check_run, check_starts, read_run
 
 T = TypeVar("T")
 
 
-def check(files: Files, identity: str = "", heads: Sequence[str] = ()) -> Checked:
+def check(files: FileSet, identity: str = "", heads: Sequence[str] = ()) -> Findings:
     """All but the replay. `identity`: the public key (hex) that the signer must have; empty: any.
 
     `heads`: of the journal, as they were noted elsewhere, hexadecimal digits.
     """
-    checked = Checked()
+    checked = Findings()
     manifest = _manifest(files, identity, checked)
     if manifest is None:
         return checked
@@ -82,7 +82,7 @@ def check(files: Files, identity: str = "", heads: Sequence[str] = ()) -> Checke
     return checked
 
 
-def _manifest(files: Files, identity: str, checked: Checked) -> Manifest | None:
+def _manifest(files: FileSet, identity: str, checked: Findings) -> Manifest | None:
     try:
         manifest = _document(files, contents.MANIFEST, Manifest, checked)
         signature = _document(files, contents.SIGNATURE, Signature, checked)
@@ -115,7 +115,7 @@ def _manifest(files: Files, identity: str, checked: Checked) -> Manifest | None:
     return manifest
 
 
-def _document(files: Files, name: str, kind: Callable[..., T] | type[T], checked: Checked) -> T:
+def _document(files: FileSet, name: str, kind: Callable[..., T] | type[T], checked: Findings) -> T:
     """A file's content. Raises ProtocolError for a damaged one. `checked` receives its unknown fields and claims."""
     data = files.read_file(name, contents.MAX_DOCUMENT_BYTES)
     content = decoded(name, data, kind)
@@ -123,7 +123,7 @@ def _document(files: Files, name: str, kind: Callable[..., T] | type[T], checked
     return content
 
 
-def _names(files: Files, manifest: Manifest, checked: Checked) -> None:
+def _names(files: FileSet, manifest: Manifest, checked: Findings) -> None:
     """Files that publication does not write, and those of the manifest that it leaves to a run's digests."""
     odd = sorted(name for name in files.names if fields.file_kind(name) is None)
     top = (contents.JOURNAL, contents.REMOVED, *contents.DESCRIPTIONS)
@@ -132,7 +132,7 @@ def _names(files: Files, manifest: Manifest, checked: Checked) -> None:
         checked.add("format", "failed", f"{name[:120]} is no file of published results: {UPDATE}")
 
 
-def _digests(files: Files, manifest: Manifest, checked: Checked) -> tuple[set[str], dict[str, str]]:
+def _digests(files: FileSet, manifest: Manifest, checked: Findings) -> tuple[set[str], dict[str, str]]:
     """The names of files that differ from those that were signed, and the signed digests of all."""
     wanted = dict(manifest.files)
     bad: list[str] = []
@@ -161,7 +161,7 @@ def _digests(files: Files, manifest: Manifest, checked: Checked) -> tuple[set[st
     return damaged, wanted
 
 
-def _journal(files: Files, manifest: Manifest, checked: Checked) -> History:
+def _journal(files: FileSet, manifest: Manifest, checked: Findings) -> History:
     try:
         lines = contents.journal_entries(files.read_file(contents.JOURNAL, contents.MAX_RECORDING_BYTES))
         entries = [journal.read_entry(line) for line in lines]
@@ -218,7 +218,7 @@ def _history_fault(entries: Sequence[journal.EpochEntry]) -> str | None:
     return None
 
 
-def _descriptions(files: Files, manifest: Manifest, digests: Mapping[str, str], checked: Checked) -> None:
+def _descriptions(files: FileSet, manifest: Manifest, digests: Mapping[str, str], checked: Findings) -> None:
     """Makes the card and its descriptions again, and compares."""
     if checked.failed:
         return
@@ -235,7 +235,7 @@ def _descriptions(files: Files, manifest: Manifest, digests: Mapping[str, str], 
             checked.claim(name, ["**"])
         return
     own = cards.make(
-        [cards.Source(run.folder, run.record, run.result) for run in checked.runs],
+        [cards.CardSource(run.folder, run.record, run.result) for run in checked.runs],
         contents.journal_entries(files.read_file(contents.JOURNAL, contents.MAX_RECORDING_BYTES)),
         signer=checked.signer,
         software=manifest.software,

@@ -24,13 +24,13 @@ from evopolicy_common.records.run_record import decode_run_record, inputs_digest
 from evopolicy_common.records.splits import SPLITS, cases_hash, overlaps
 from evopolicy_common.terminal import counted
 from evopolicy_results.publish import contents, fields
-from evopolicy_results.publish.contents import Group
+from evopolicy_results.publish.contents import EpisodeGroup
 from evopolicy_results.publish.findings import (
     KINDS,
     UPDATE,
-    Checked,
-    Fault,
-    Files,
+    DocumentFault,
+    FileSet,
+    Findings,
     History,
     PublishedRun,
     decoded,
@@ -45,7 +45,7 @@ _PARSED = "classes functions imports import_count cyclomatic_total cyclomatic_ma
 _DOCUMENTS = (contents.OPENING, contents.RESULT, contents.EPISODES, contents.RUN)
 
 
-def read_run(files: Files, folder: str, checked: Checked) -> PublishedRun | None:
+def read_run(files: FileSet, folder: str, checked: Findings) -> PublishedRun | None:
     place = {name: f"{folder}/{name}" for name in (*_DOCUMENTS, contents.SALT)}
     try:
         data = {name: files.read_file(path, contents.MAX_DOCUMENT_BYTES) for name, path in place.items()}
@@ -57,7 +57,7 @@ def read_run(files: Files, folder: str, checked: Checked) -> PublishedRun | None
             opening=decoded(place[contents.OPENING], data[contents.OPENING], Opening),
             salt=bytes.fromhex(salt),
             result=decoded(place[contents.RESULT], data[contents.RESULT], RunResult),
-            groups=decoded(place[contents.EPISODES], data[contents.EPISODES], tuple[Group, ...]),
+            groups=decoded(place[contents.EPISODES], data[contents.EPISODES], tuple[EpisodeGroup, ...]),
             opening_bytes=data[contents.OPENING],
             result_bytes=data[contents.RESULT],
             as_written=written[contents.RUN],
@@ -72,10 +72,15 @@ def read_run(files: Files, folder: str, checked: Checked) -> PublishedRun | None
     return run
 
 
-def check_run(files: Files, run: PublishedRun, history: History, damaged: set[str], checked: Checked) -> None:
+def check_run(
+    files: FileSet, run: PublishedRun, history: History, damaged: set[str], checked: Findings
+) -> None:
     name = run.opening.run
     for kind, rule in _RULES.items():
-        faults = [each if isinstance(each, Fault) else Fault(kind, each) for each in rule(run, history)]
+        faults = [
+            each if isinstance(each, DocumentFault) else DocumentFault(kind, each)
+            for each in rule(run, history)
+        ]
         for fault in faults:
             checked.add(fault.kind, "failed", fault.text, name)
         if not faults:
@@ -93,7 +98,7 @@ def check_run(files: Files, run: PublishedRun, history: History, damaged: set[st
     checked.add("policies", "open", text, name)
 
 
-def check_starts(checked: Checked) -> None:
+def check_starts(checked: Findings) -> None:
     """Adds a finding for each run: whether it starts from another one, and under no weaker conditions than that one."""
     lines = {run.opening.run: run.record.line for run in checked.runs}
     for run in checked.runs:
@@ -111,11 +116,11 @@ def check_starts(checked: Checked) -> None:
                 checked.add("commitment", "failed", text, name)
 
 
-def _commitment(run: PublishedRun, history: History) -> Iterator[str | Fault]:
+def _commitment(run: PublishedRun, history: History) -> Iterator[str | DocumentFault]:
     opening, settings, place = run.opening, run.opening.settings, run.record.committed
     numbered = history.entry(Opened, opening.run)
     if numbered is None:
-        yield Fault("journal", "the journal has no entry of this run")
+        yield DocumentFault("journal", "the journal has no entry of this run")
         return
     number, entry = numbered
     if len(run.salt) != journal.SALT_BYTES:
@@ -126,10 +131,14 @@ def _commitment(run: PublishedRun, history: History) -> Iterator[str | Fault]:
     if entry.epoch != opening.epoch or any(getattr(entry, name) != getattr(settings, name) for name in names):
         yield "the journal opened it for another entry, environment, experiment, epoch or start"
     if entry.start is not None and history.entry(Opened, entry.start.run) is None:
-        yield Fault("journal", f"it starts from run {entry.start.run}, of which the journal has no entry")
+        yield DocumentFault(
+            "journal", f"it starts from run {entry.start.run}, of which the journal has no entry"
+        )
     fixed = (entry.commitment, number, history.heads[number], entry.epoch)
     if place is None or (place.commitment, place.opened, place.opened_head, place.epoch) != fixed:
-        yield Fault("record", "run.json has another commitment or head of the journal than the journal has")
+        yield DocumentFault(
+            "record", "run.json has another commitment or head of the journal than the journal has"
+        )
     if of := settings.replay_of or entry.replay_of:
         yield f"it is a replay of run {of}, and no run of its own"
     if repeated := overlaps({split: run.cases(split) for split in SPLITS}):
@@ -142,7 +151,7 @@ def _disclosure(run: PublishedRun, history: History) -> Iterator[str]:
         yield f"epoch {epoch} was not revealed: its cases may still be played as secret ones"
 
 
-def _result(run: PublishedRun, history: History) -> Iterator[str | Fault]:
+def _result(run: PublishedRun, history: History) -> Iterator[str | DocumentFault]:
     numbered, place = history.entry(Ended, run.opening.run), run.record.committed
     if numbered is None:
         yield "the journal has no end of this run"
@@ -153,10 +162,10 @@ def _result(run: PublishedRun, history: History) -> Iterator[str | Fault]:
     if run.result.status != entry.status:
         yield f"it ended as {entry.status}, not as {run.result.status}"
     if place is None or (place.ended, place.ended_head) != (number, history.heads[number]):
-        yield Fault("record", "run.json has another end of the run than the journal has")
+        yield DocumentFault("record", "run.json has another end of the run than the journal has")
 
 
-def _record(run: PublishedRun, history: History) -> Iterator[str | Fault]:
+def _record(run: PublishedRun, history: History) -> Iterator[str | DocumentFault]:
     """`run.json`, compared with what `account.run_record` makes of the committed documents and of its claims."""
     record, opening, result, place = run.record, run.opening, run.result, run.record.committed
     if place is None:
@@ -191,7 +200,9 @@ def _record(run: PublishedRun, history: History) -> Iterator[str | Fault]:
     )
     for name, here, wanted in unlike_documents(run.as_written, as_json(account.run_record(finished, claims))):
         if wanted is MISSING:
-            yield Fault("format", f"run.json: {name[:120]} is no field of published results: {UPDATE}")
+            yield DocumentFault(
+                "format", f"run.json: {name[:120]} is no field of published results: {UPDATE}"
+            )
         else:
             yield f"run.json has {name} {short(here)}; the committed documents give {short(wanted)}"
     told_inputs = inputs_digest(record.agent.inputs)
@@ -311,7 +322,7 @@ def _chosen_world(run: PublishedRun) -> str:
     return f"{env} has candidate {number} of {worlds.CANDIDATES}: {how}"
 
 
-_RULES: dict[str, Callable[[PublishedRun, History], Iterator[str | Fault]]] = {
+_RULES: dict[str, Callable[[PublishedRun, History], Iterator[str | DocumentFault]]] = {
     "commitment": _commitment,
     "disclosure": _disclosure,
     "result": _result,
@@ -321,10 +332,10 @@ _RULES: dict[str, Callable[[PublishedRun, History], Iterator[str | Fault]]] = {
     "scores": _scores,
     "worlds": _worlds,
 }
-"""By the kind of their findings; a `Fault` is of another kind."""
+"""By the kind of their findings; a `DocumentFault` is of another kind."""
 
 
-def _recordings(files: Files, run: PublishedRun, damaged: set[str], checked: Checked) -> None:
+def _recordings(files: FileSet, run: PublishedRun, damaged: set[str], checked: Findings) -> None:
     lists = f"{run.folder}/actions/"
     recorded: dict[str, tuple[int, int]] = {}
     checked.recorded[run.opening.run] = recorded
@@ -360,7 +371,7 @@ def _recordings(files: Files, run: PublishedRun, damaged: set[str], checked: Che
     checked.conclude("recordings", faults, episodes, run.opening.run, open_text)
 
 
-def recording_fault(episode: contents.Episode, data: bytes) -> str | None:
+def recording_fault(episode: contents.PublishedEpisode, data: bytes) -> str | None:
     """The contradiction between a recording and the stated result of its episode; None if there is none."""
     try:
         recording = recording_of(data)
@@ -391,7 +402,7 @@ def return_of(recording: Trajectory) -> float:
     return total
 
 
-def _checkpoints(files: Files, run: PublishedRun, damaged: set[str], checked: Checked) -> None:
+def _checkpoints(files: FileSet, run: PublishedRun, damaged: set[str], checked: Findings) -> None:
     folder = f"{run.folder}/"
     places = {folder + contents.checkpoint_path(one.submit_index) for one in run.result.submits if one.bundle}
     odd = sorted(path for path in files.names - places if path.startswith(f"{folder}checkpoints/"))
@@ -411,7 +422,7 @@ def _checkpoints(files: Files, run: PublishedRun, damaged: set[str], checked: Ch
         checked.add("record", "failed", fault, run.opening.run)
 
 
-def _metrics(run: PublishedRun, policies: dict[int, Bundle], checked: Checked) -> Iterator[str]:
+def _metrics(run: PublishedRun, policies: dict[int, Bundle], checked: Findings) -> Iterator[str]:
     """The metrics of code in `run.json`, compared with the policies."""
     by_submit = run.record.outcome.auxiliary.get(_BY_SUBMIT, {})
     file = f"{run.folder}/{contents.RUN}"

@@ -22,7 +22,7 @@ import msgspec
 from evopolicy_common.records.agent_log import parts
 from evopolicy_common.records.json_text import objects
 from evopolicy_common.regular_files import open_regular
-from evopolicy_results.reading.records import Submit
+from evopolicy_results.reading.records import PastSubmit
 
 MAX_LOG_BYTES = 64 << 20
 """Later bytes of a log are not read."""
@@ -75,7 +75,7 @@ class LogReading(msgspec.Struct, frozen=True, kw_only=True):
     """Messages from a log that shows no submits, or after the last submit."""
 
 
-def read_agent_log(path: Path, submits: Sequence[Submit]) -> LogReading:
+def read_agent_log(path: Path, submits: Sequence[PastSubmit]) -> LogReading:
     """Reads a run's log; empty when it is missing. Never raises for damaged content."""
     try:
         every = (event for value in objects(_lines(path)) for event in _events_of(value))
@@ -94,7 +94,7 @@ _Groups = dict[int | None, list[LogEvent]]
 """Events by the submit that they precede; None: by no known one."""
 
 
-def _by_results(events: Sequence[LogEvent], submits: Sequence[Submit]) -> _Groups:
+def _by_results(events: Sequence[LogEvent], submits: Sequence[PastSubmit]) -> _Groups:
     groups: _Groups = {}
     pending: list[LogEvent] = []
     places = {submit.index: place for place, submit in enumerate(submits)}
@@ -108,7 +108,7 @@ def _by_results(events: Sequence[LogEvent], submits: Sequence[Submit]) -> _Group
     return {**groups, None: pending}
 
 
-def _by_times(events: Sequence[LogEvent], submits: Sequence[Submit]) -> _Groups:
+def _by_times(events: Sequence[LogEvent], submits: Sequence[PastSubmit]) -> _Groups:
     starts = [(at, submit.index) for submit in submits if (at := _instant(submit.started_at)) is not None]
     # An event goes to the first submit that starts late enough, so a submit listed after a later start gets none.
     latest = list(itertools.accumulate((at for at, _ in starts), max))

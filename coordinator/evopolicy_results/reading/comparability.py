@@ -23,7 +23,7 @@ from evopolicy_common.messages.run_settings import AllConditions
 from evopolicy_common.records.run_record import inputs_digest
 from evopolicy_common.terminal import counted
 from evopolicy_results.reading.environments import grouped, ordered_environments, suites_of
-from evopolicy_results.reading.records import Run, path_text
+from evopolicy_results.reading.records import PastRun, path_text
 
 _CODE = "evopolicy-worker"
 
@@ -90,10 +90,10 @@ UNKNOWN_ISOLATION = "hidden isolation, which some runs do not record,"
 class _Setting(NamedTuple):
     """A setting in which compared runs have to agree."""
 
-    of: Callable[[Run], str]
+    of: Callable[[PastRun], str]
     remedy: str = ""
     """How to play runs that agree in it; empty where no option decides it."""
-    concerns: Callable[[Run], object] = lambda run: True
+    concerns: Callable[[PastRun], object] = lambda run: True
     """Other runs may stand beside those that it concerns."""
 
 
@@ -102,7 +102,7 @@ def _dimension(name: str, option: str) -> _Setting:
 
 
 def _split(split: Split) -> _Setting:
-    def of(run: Run) -> str:
+    def of(run: PastRun) -> str:
         if split != "train" and run.record.experiment_dimensions.hidden_cases == "per_run":
             return "its own"
         return _short(run.record.versions.cases_hash(split))
@@ -116,7 +116,7 @@ def _short(digest: str) -> str:
     return digest.removeprefix("sha256:")[:12]
 
 
-def _step_limit(run: Run) -> str:
+def _step_limit(run: PastRun) -> str:
     """Empty if the environment has only one limit."""
     entry = catalogue.entries().get(run.env)
     both = entry is not None and entry.published_steps is not None
@@ -194,7 +194,7 @@ REMEDIES = {
 """By `Mixture.what`: how to play runs that agree in it."""
 
 
-def mixtures(runs: Iterable[Run]) -> list[Mixture]:
+def mixtures(runs: Iterable[PastRun]) -> list[Mixture]:
     """Every difference between runs of one suite or environment; empty for a fair comparison."""
     by_env = grouped(runs, lambda run: run.env)
     out: list[Mixture] = []
@@ -209,13 +209,13 @@ def mixtures(runs: Iterable[Run]) -> list[Mixture]:
     return out
 
 
-def _fingerprint_beside(runs: list[Run]) -> Callable[[Run], str]:
+def _fingerprint_beside(runs: list[PastRun]) -> Callable[[PastRun], str]:
     """A function for the parts of a run's fingerprint that differ among `runs`, and the operator's overrides."""
     compared = comparable([run.record.versions.fingerprint for run in runs])
     items = {id(run): set(parts.items()) for run, parts in zip(runs, compared, strict=True)}
     common = set.intersection(*items.values())
 
-    def beside(run: Run) -> str:
+    def beside(run: PastRun) -> str:
         versions = run.record.versions
         words = [f"{k}={v}" for k, v in sorted(items[id(run)] - common)]
         return " ".join([*words, *(f"then {each}" for each in versions.fingerprint_overrides)])
@@ -223,7 +223,7 @@ def _fingerprint_beside(runs: list[Run]) -> Callable[[Run], str]:
     return beside
 
 
-def _differences(settings: dict[str, _Setting], where: str, runs: list[Run]) -> list[Mixture]:
+def _differences(settings: dict[str, _Setting], where: str, runs: list[PastRun]) -> list[Mixture]:
     out: list[Mixture] = []
     for what, setting in settings.items():
         by_value: dict[str, list[str]] = {}

@@ -39,7 +39,7 @@ from evopolicy_results.code.topology import describe
 from evopolicy_results.reading import published
 from evopolicy_results.reading.parallel import ALONE, Processes
 from evopolicy_results.reading.published import PUBLISHED
-from evopolicy_results.reading.records import LeftOut, Run, Source, Submit
+from evopolicy_results.reading.records import LeftOut, PastRun, PastSubmit, PolicySource
 
 Files = Mapping[str, bytes]
 
@@ -49,7 +49,7 @@ _MAX_REASON_CHARS = 1000
 class Loaded(msgspec.Struct, frozen=True, kw_only=True):
     """The results of `load_runs`, both in order of path."""
 
-    runs: tuple[Run, ...]
+    runs: tuple[PastRun, ...]
     left_out: tuple[LeftOut, ...]
 
 
@@ -77,7 +77,7 @@ def load_runs(
     too. `processes` read in parallel; `progress` is called with (done, total)."""
     folders, left_out = find_run_dirs(paths)
     read = processes.map(read_or_explain, folders, lambda folder, why: LeftOut(path=folder, reason=why))
-    seen: dict[tuple[bool, str, str, str, int], Run] = {}
+    seen: dict[tuple[bool, str, str, str, int], PastRun] = {}
     for done, run in enumerate(read, start=1):
         if progress is not None:
             progress(done, len(folders))
@@ -92,7 +92,7 @@ def load_runs(
     return Loaded(runs=reconciled(list(seen.values())), left_out=tuple(left_out))
 
 
-def reconciled(runs: Sequence[Run]) -> tuple[Run, ...]:
+def reconciled(runs: Sequence[PastRun]) -> tuple[PastRun, ...]:
     """The runs, where a published run has the splits of our runs on its files, and an entry of its own if one of ours
     has its name.
 
@@ -107,7 +107,7 @@ def reconciled(runs: Sequence[Run]) -> tuple[Run, ...]:
             by_cases = used.setdefault((split, versions.file_hash(split)), {})
             by_cases.setdefault(versions.cases_hash(split), set()).add(n)
 
-    def reconcile(run: Run) -> Run:
+    def reconcile(run: PastRun) -> PastRun:
         agent, versions = run.record.agent, run.record.versions
         hashes = dict(versions.cases_hashes)
         for split in SPLITS:
@@ -125,7 +125,7 @@ def reconciled(runs: Sequence[Run]) -> tuple[Run, ...]:
     return tuple(reconcile(run) if run.is_published else run for run in runs)
 
 
-def read_or_explain(folder: Path) -> Run | LeftOut:
+def read_or_explain(folder: Path) -> PastRun | LeftOut:
     """The run in `folder`, or the reason why it is left out."""
     try:
         return read_run(folder)
@@ -134,7 +134,7 @@ def read_or_explain(folder: Path) -> Run | LeftOut:
         return LeftOut(path=folder, reason=f"{kind}{error}"[:_MAX_REASON_CHARS])
 
 
-def read_run(folder: Path) -> Run:
+def read_run(folder: Path) -> PastRun:
     """Reads the complete run in `folder`. Raises UnreadableRunError with the reason when there is none."""
     record = _read_record(folder)
     outcome = record.outcome
@@ -151,7 +151,7 @@ def read_run(folder: Path) -> Run:
             raise UnreadableRunError("run.json says completed, and has no final_score")
         if outcome.best_submit_index is None:
             raise UnreadableRunError("run.json says completed, and has no best_submit_index")
-    run = Run(path=folder, record=record, submits=_read_submits(folder, record))
+    run = PastRun(path=folder, record=record, submits=_read_submits(folder, record))
     if outcome.status == "completed" and run.selected is None:
         raise UnreadableRunError(f"the selected submit {outcome.best_submit_index} has no files")
     try:
@@ -174,9 +174,9 @@ def _read_record(folder: Path) -> RunRecord:
     return record
 
 
-def _read_submits(folder: Path, record: RunRecord) -> tuple[Submit, ...]:
+def _read_submits(folder: Path, record: RunRecord) -> tuple[PastSubmit, ...]:
     budget = record.experiment_dimensions.episode_budget
-    submits: list[Submit] = []
+    submits: list[PastSubmit] = []
     previous: Files | None = None
     consumed = 0
     for one in read_submits(folder, record.artifacts):
@@ -208,7 +208,7 @@ def _read_submits(folder: Path, record: RunRecord) -> tuple[Submit, ...]:
         changed = None if files is None or previous is None else count_changed_lines(previous, files)
         previous = previous if files is None else files
         submits.append(
-            Submit(
+            PastSubmit(
                 index=index,
                 status=status,
                 n_episodes=n_episodes,
@@ -244,11 +244,11 @@ def _reasons(name: str = "") -> Iterator[None]:
         raise UnreadableRunError(f"{name}{error}") from error
 
 
-_described: dict[str, Source] = {}
+_described: dict[str, PolicySource] = {}
 _MAX_DESCRIBED = 4096
 
 
-def describe_files(files: Files) -> tuple[Files, Source | None]:
+def describe_files(files: Files) -> tuple[Files, PolicySource | None]:
     """The reachable source files among a bundle's Python files, and their description; None without a `policy.py`.
     Descriptions of recent bundles are kept, as runs share policies."""
     modules = reachable_modules(files)
@@ -259,7 +259,7 @@ def describe_files(files: Files) -> tuple[Files, Source | None]:
     known = _described.get(digest)
     if known is None:
         topology, features = describe(modules)
-        known = _described[digest] = Source(
+        known = _described[digest] = PolicySource(
             digest=digest, topology=topology, features=features, files=tuple(sorted(reached))
         )
         if len(_described) > _MAX_DESCRIBED:
@@ -277,7 +277,7 @@ _SHOWN = 4
 _HELDOUT: Split = "heldout"
 
 
-def rescored(runs: Sequence[Run], name: str) -> list[Run]:
+def rescored(runs: Sequence[PastRun], name: str) -> list[PastRun]:
     """The runs with the held-out results of their re-score `name`; runs without a selected checkpoint stay as they are.
     Raises ConfigError when a run has no such re-score, or one of another run."""
     missing, out = [], []
@@ -309,7 +309,7 @@ def rescored(runs: Sequence[Run], name: str) -> list[Run]:
     return out
 
 
-def _replaced(run: Run, record: RescoreRecord, played: Rescored) -> Run:
+def _replaced(run: PastRun, record: RescoreRecord, played: Rescored) -> PastRun:
     outcome, versions, random = run.record.outcome, run.record.versions, record.random_returns
     replaced = replace(
         run.record,

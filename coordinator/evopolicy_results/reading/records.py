@@ -1,7 +1,7 @@
 """The analysis's records: a run read from its directory, its submits, and the paths left out.
 
-Typed, immutable, without policy sources (those stay on disk, at `Run.checkpoint`), so that a thousand runs fit in
-memory. `rows` turns any list of records into dicts for a data frame.
+Typed, immutable, without policy sources (those stay on disk, at `PastRun.checkpoint`), so that a thousand runs fit
+in memory. `rows` turns any list of records into dicts for a data frame.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ EditType = Literal["first", "synthesis", "parametric", "rollback", "retest", "da
 """Relation of a score-bearing submit to the one before it; see `edits`."""
 
 
-class Source(msgspec.Struct, frozen=True, kw_only=True):
+class PolicySource(msgspec.Struct, frozen=True, kw_only=True):
     """Description of one checkpoint's policy source bundle (`policy.py` and reachable local modules)."""
 
     digest: str
@@ -36,7 +36,7 @@ class Source(msgspec.Struct, frozen=True, kw_only=True):
     """Paths of the bundle's files under `system/`."""
 
 
-class Submit(msgspec.Struct, frozen=True, kw_only=True):
+class PastSubmit(msgspec.Struct, frozen=True, kw_only=True):
     index: int
     status: str
     n_episodes: int
@@ -52,7 +52,7 @@ class Submit(msgspec.Struct, frozen=True, kw_only=True):
     started_at: str = ""
     bundle_digest: str = ""
     """Digest of the whole `system/`, including data files; empty when unknown."""
-    source: Source | None = None
+    source: PolicySource | None = None
     """None when there is no readable checkpoint."""
     changed_lines: int | None = None
     """Lines added plus removed in the source bundle since the previous ok submit; None for the first, or if unknown."""
@@ -70,12 +70,12 @@ class Submit(msgspec.Struct, frozen=True, kw_only=True):
         return self.status == "ok" and self.val_mean is not None and self.source is not None
 
 
-class Run(msgspec.Struct, frozen=True, kw_only=True):
+class PastRun(msgspec.Struct, frozen=True, kw_only=True):
     """One complete run directory."""
 
     path: Path
     record: RunRecord
-    submits: tuple[Submit, ...]
+    submits: tuple[PastSubmit, ...]
     """In order of their index."""
     rescore: RescoreRecord | None = None
     """The re-score that the record's held-out results were replaced by; None for the run's own."""
@@ -121,12 +121,12 @@ class Run(msgspec.Struct, frozen=True, kw_only=True):
         return self.record.outcome.score
 
     @property
-    def scored(self) -> tuple[Submit, ...]:
+    def scored(self) -> tuple[PastSubmit, ...]:
         """Score-bearing submits in order."""
         return tuple(submit for submit in self.submits if submit.is_scored)
 
     @property
-    def selected(self) -> Submit | None:
+    def selected(self) -> PastSubmit | None:
         best = self.record.outcome.best_submit_index
         return next((submit for submit in self.submits if submit.index == best), None)
 
@@ -167,7 +167,7 @@ def checkpoint_folder(run: Path, folder: str, index: int) -> Path:
     return next((place for place in places if place.is_dir()), places[0])
 
 
-def by_cell(runs: Iterable[Run]) -> dict[tuple[str, str], list[Run]]:
+def by_cell(runs: Iterable[PastRun]) -> dict[tuple[str, str], list[PastRun]]:
     """The runs by (environment, entry): environments in catalogue order, entries by name."""
     cells = grouped(runs, lambda run: (run.env, run.entry))
     place = {env: i for i, env in enumerate(ordered_environments(env for env, _ in cells))}

@@ -59,7 +59,7 @@ class Wanted(msgspec.Struct, frozen=True, kw_only=True):
     """All eligible checkpoints instead of the selected one."""
 
 
-class Finished(msgspec.Struct, frozen=True, kw_only=True):
+class RunToRescore(msgspec.Struct, frozen=True, kw_only=True):
     """A finished run with a selected checkpoint."""
 
     folder: Path
@@ -87,7 +87,7 @@ class Written(msgspec.Struct, frozen=True, kw_only=True):
     """Played by this command or an interrupted one before it; 0 when the file was complete."""
 
 
-def read_finished(folders: Sequence[Path]) -> tuple[list[Finished], list[str], list[str]]:
+def read_finished(folders: Sequence[Path]) -> tuple[list[RunToRescore], list[str], list[str]]:
     """The runs in these directories, those without anything to re-score, and damaged or unfinished ones; with
     reasons."""
     finished, without, unreadable = [], [], []
@@ -99,11 +99,11 @@ def read_finished(folders: Sequence[Path]) -> tuple[list[Finished], list[str], l
             without.append(f"{folder}: {in_words(record.outcome.status)}, without a selected checkpoint")
         else:
             selected = record.outcome.best_submit_index
-            finished.append(Finished(folder=folder, record=record, selected=selected))
+            finished.append(RunToRescore(folder=folder, record=record, selected=selected))
     return finished, without, unreadable
 
 
-async def rescore(run: Finished, wanted: Wanted, evaluations: Evaluations) -> Written:
+async def rescore(run: RunToRescore, wanted: Wanted, evaluations: Evaluations) -> Written:
     """Plays the missing episodes of one run and writes its file. Raises ConfigError for runs, cases or versions
     that do not fit."""
     try:
@@ -114,7 +114,7 @@ async def rescore(run: Finished, wanted: Wanted, evaluations: Evaluations) -> Wr
         raise
 
 
-async def _rescore(run: Finished, wanted: Wanted, evaluations: Evaluations) -> Written:
+async def _rescore(run: RunToRescore, wanted: Wanted, evaluations: Evaluations) -> Written:
     record, path = run.record, rescore_path(run.folder, wanted.name)
     fingerprint_class = await class_of(record, evaluations)
     cases, secret, epoch = await _cases(record, wanted, evaluations)

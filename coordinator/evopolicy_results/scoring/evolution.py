@@ -15,7 +15,7 @@ import msgspec
 
 from evopolicy_results.behaviour.edits import classify
 from evopolicy_results.reading.environments import grouped, ordered_environments
-from evopolicy_results.reading.records import Run
+from evopolicy_results.reading.records import PastRun
 from evopolicy_results.scoring.scores import Scale, scale_between
 
 
@@ -51,7 +51,7 @@ class Evolution(msgspec.Struct, frozen=True, kw_only=True):
     to_80: int | None
 
 
-def evolutions(runs: Iterable[Run], references: Mapping[str, float]) -> list[Evolution]:
+def evolutions(runs: Iterable[PastRun], references: Mapping[str, float]) -> list[Evolution]:
     """Every run's curve, environments in catalogue order, then by entry and run. `references`: by environment, the mean
     return of the random reference, if known."""
     by_env = grouped(runs, lambda run: run.env)
@@ -81,7 +81,7 @@ def evolutions(runs: Iterable[Run], references: Mapping[str, float]) -> list[Evo
     return out
 
 
-def _curve(run: Run) -> tuple[CurvePoint, ...]:
+def _curve(run: PastRun) -> tuple[CurvePoint, ...]:
     return tuple(
         CurvePoint(index=t.index, consumed=t.consumed, val_mean=t.val_mean, best=t.best, improved=t.hit)
         for t in classify(run.submits)

@@ -31,7 +31,7 @@ from evopolicy_common.catalogue import anchor
 from evopolicy_common.errors import ConfigError
 from evopolicy_results.behaviour.edits import demand_of
 from evopolicy_results.reading.environments import by_name, family_of, grouped, ordered_environments
-from evopolicy_results.reading.records import Run
+from evopolicy_results.reading.records import PastRun
 
 RANDOM_ENTRY = "Random policy"
 RANDOM_HARNESS = "Uniform"
@@ -148,7 +148,7 @@ def mean_of_all(values: Sequence[float | None]) -> float | None:
     return fmean(known) if known and len(known) == len(values) else None
 
 
-def score_table(runs: Iterable[Run]) -> ScoreTable:
+def score_table(runs: Iterable[PastRun]) -> ScoreTable:
     """Builds the cells of the runs, and the random reference from the runs' own records on their held-out cases."""
     runs = list(runs)
     harness = {
@@ -174,7 +174,7 @@ def score_table(runs: Iterable[Run]) -> ScoreTable:
     return ScoreTable(cells=cells, harness=harness, reference=name if means else None)
 
 
-def returns_of(run: Run) -> RunReturns:
+def returns_of(run: PastRun) -> RunReturns:
     shared = run.record.experiment_dimensions.hidden_cases == "shared"
     return RunReturns(
         score=run.score,
@@ -184,7 +184,7 @@ def returns_of(run: Run) -> RunReturns:
     )
 
 
-def _reference_of(run: Run) -> RunReturns | None:
+def _reference_of(run: PastRun) -> RunReturns | None:
     """The recorded returns of the random reference on the run's cases; None for cases or actions of its own."""
     recorded, case_set = run.record.outcome.random_reference, returns_of(run).case_set
     if recorded is None or not recorded.returns or not case_set:
@@ -192,7 +192,7 @@ def _reference_of(run: Run) -> RunReturns | None:
     return RunReturns(score=recorded.mean_return, returns=recorded.returns, case_set=case_set)
 
 
-def references(runs: Iterable[Run]) -> dict[str, float]:
+def references(runs: Iterable[PastRun]) -> dict[str, float]:
     """Mean held-out return of uniform random actions by environment: one number per held-out split.
 
     The actions follow from split and case, so all runs on a split record the same number. An environment whose runs

@@ -15,7 +15,7 @@ import msgspec
 
 from evopolicy_common.statistics.intervals import Estimate
 from evopolicy_results.reading.environments import family_of
-from evopolicy_results.reading.records import Run, by_cell
+from evopolicy_results.reading.records import PastRun, by_cell
 from evopolicy_results.scoring.scores import Scale, mean_of_all
 from evopolicy_results.statistics.intervals import of_runs
 
@@ -43,7 +43,7 @@ class Generalisation(msgspec.Struct, frozen=True, kw_only=True):
     """Share of held-out episodes that reached the goal, as environment or returns tell it; None if neither does."""
 
 
-def generalisation(runs: Iterable[Run], scales: Mapping[str, Scale]) -> list[Generalisation]:
+def generalisation(runs: Iterable[PastRun], scales: Mapping[str, Scale]) -> list[Generalisation]:
     """Every entry on every environment with a completed run, environments in catalogue order."""
     completed = by_cell(run for run in runs if run.score is not None)
     return [_cell(entry, env, several, scales.get(env)) for (env, entry), several in completed.items()]
@@ -56,7 +56,7 @@ def optimism(entries: Iterable[str], cells: Sequence[Generalisation]) -> dict[st
     return {entry: of_runs(several) for entry, several in values.items() if several}
 
 
-def _cell(entry: str, env: str, runs: Sequence[Run], scale: Scale | None) -> Generalisation:
+def _cell(entry: str, env: str, runs: Sequence[PastRun], scale: Scale | None) -> Generalisation:
     heldout = fmean(run.score for run in runs if run.score is not None)
     selected = [run.selected for run in runs]
     validation = mean_of_all([None if each is None else each.val_mean for each in selected])
@@ -76,7 +76,7 @@ def _cell(entry: str, env: str, runs: Sequence[Run], scale: Scale | None) -> Gen
     )
 
 
-def _success(env: str, runs: Sequence[Run]) -> float | None:
+def _success(env: str, runs: Sequence[PastRun]) -> float | None:
     outcomes = [run.record.outcome for run in runs]
     if any(not outcome.heldout_returns for outcome in outcomes):
         return None

@@ -15,7 +15,7 @@ import msgspec
 from evopolicy_common.messages.run_settings import Start
 from evopolicy_common.statistics.intervals import RESAMPLES
 from evopolicy_results.reading.environments import grouped
-from evopolicy_results.reading.records import Run
+from evopolicy_results.reading.records import PastRun
 from evopolicy_results.scoring.scores import Cell, returns_of
 from evopolicy_results.statistics.pairs import Pair, pairs
 
@@ -37,18 +37,18 @@ class StartGroup(msgspec.Struct, frozen=True, kw_only=True):
     pairs: tuple[Pair, ...]
 
 
-def by_state(runs: Iterable[Run]) -> dict[tuple[str, int, str], list[Run]]:
+def by_state(runs: Iterable[PastRun]) -> dict[tuple[str, int, str], list[PastRun]]:
     """Runs that start from a submit, by its run, index and tree."""
     started = [(run, run.record.start) for run in runs if run.record.start is not None]
     groups = grouped(started, lambda one: (one[1].run, one[1].submit_index, one[1].tree))
     return {state: [run for run, _ in group] for state, group in groups.items()}
 
 
-def start_groups(runs: Sequence[Run], *, resamples: int = RESAMPLES) -> list[StartGroup]:
+def start_groups(runs: Sequence[PastRun], *, resamples: int = RESAMPLES) -> list[StartGroup]:
     names = {run.record.run: f"{run.entry} / {run.record.exp_id}" for run in runs if run.record.run}
     out = []
     for (parent, _, _), group in by_state(runs).items():
-        variants: dict[str, list[Run]] = {}
+        variants: dict[str, list[PastRun]] = {}
         for run, label in zip(group, _labels(group), strict=True):
             variants.setdefault(label, []).append(run)
         env, starts = group[0].env, [run.record.start for run in group if run.record.start is not None]
@@ -69,7 +69,7 @@ def start_groups(runs: Sequence[Run], *, resamples: int = RESAMPLES) -> list[Sta
     return out
 
 
-def _labels(runs: Sequence[Run]) -> list[str]:
+def _labels(runs: Sequence[PastRun]) -> list[str]:
     """The entry of each run, with the settings in which they differ."""
     described = [
         {

@@ -43,7 +43,7 @@ class Paired(msgspec.Struct, frozen=True, kw_only=True):
     n_worlds: int
 
 
-class CurvePoint(msgspec.Struct, frozen=True, kw_only=True):
+class WorldPoint(msgspec.Struct, frozen=True, kw_only=True):
     """The best so far after some episodes, mean over environments; random actions count from the start."""
 
     episodes: int
@@ -56,7 +56,7 @@ class Worlds(msgspec.Struct, frozen=True, kw_only=True):
 
     paired: tuple[Paired, ...]
     """By entry: all environments, families if there are several, then each environment."""
-    curves: dict[str, tuple[CurvePoint, ...]]
+    curves: dict[str, tuple[WorldPoint, ...]]
     """By agent."""
 
 
@@ -125,7 +125,7 @@ def _paired(entry: str, scope: str, cells: Sequence[_Cell]) -> Paired:
     )
 
 
-def _curve(evolutions: Sequence[Evolution], pairs: dict[str, list[str]]) -> tuple[CurvePoint, ...]:
+def _curve(evolutions: Sequence[Evolution], pairs: dict[str, list[str]]) -> tuple[WorldPoint, ...]:
     """The curve over the environments of which the entry has played all of the report's worlds."""
     by_env = grouped(evolutions, lambda one: one.env)
     whole = {env: worlds for env, worlds in pairs.items() if all(each in by_env for each in (env, *worlds))}
@@ -138,10 +138,10 @@ def _curve(evolutions: Sequence[Evolution], pairs: dict[str, list[str]]) -> tupl
     def unchanged_at(env: str, levels: list[float]) -> Stratum:
         return stratum_of(clustered(np.array(levels), by_policy([one.policy for one in by_env[env]])))
 
-    def point(episodes: int) -> CurvePoint:
+    def point(episodes: int) -> WorldPoint:
         levels = {env: [_level(one, episodes) for one in by_env[env]] for env in played}
         after = [stratum_of([fmean(levels[each]) for each in worlds]) for worlds in whole.values()]
-        return CurvePoint(
+        return WorldPoint(
             episodes=episodes,
             unchanged=stratified([unchanged_at(env, levels[env]) for env in whole], share, "runs"),
             worlds=stratified(after, share, "worlds, runs, and cases"),

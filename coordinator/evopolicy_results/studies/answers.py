@@ -10,12 +10,12 @@ import msgspec
 from evopolicy_common.statistics.intervals import Estimate
 from evopolicy_common.terminal import counted, duration, number
 from evopolicy_results.reading.environments import title_of
-from evopolicy_results.reading.records import Run
+from evopolicy_results.reading.records import PastRun
 from evopolicy_results.scoring.scores import Cell
 from evopolicy_results.statistics.intervals import decimals, rounded, valued
 from evopolicy_results.statistics.pairs import Pair
 from evopolicy_results.statistics.standings import RankEstimate
-from evopolicy_results.studies.study import Study, Suite
+from evopolicy_results.studies.study import Study, SuiteStudy
 
 _NAMED = 6
 """Names that a sentence lists."""
@@ -75,7 +75,7 @@ def _names(names: Sequence[str]) -> str:
     return " and ".join(filter(None, (", ".join(shown[:-1]), shown[-1])))
 
 
-def _of_ranks(suite: Suite) -> Leader:
+def _of_ranks(suite: SuiteStudy) -> Leader:
     rows, estimates = suite.board.standings, suite.statistics.standings
     agents = [row for row in rows if not row.is_reference and row.score is not None]
     if not agents or rows[0].is_reference:
@@ -110,7 +110,7 @@ def _scored(score: float | None, estimate: RankEstimate | None) -> str:
     return valued(Estimate(value=value, low=estimate.score_low, high=estimate.score_high))
 
 
-def _of_returns(suite: Suite) -> Leader:
+def _of_returns(suite: SuiteStudy) -> Leader:
     (env,) = suite.table.environments
     column = suite.table.column(env)
     agents = [entry for entry in suite.table.agents if column.get(entry) is not None]
@@ -167,7 +167,7 @@ def _apart(tied: Sequence[str], n_others: int) -> str:
     return f"Not told apart from it at 5 %: {_names(tied)}."
 
 
-def _cost(runs: Sequence[Run]) -> str:
+def _cost(runs: Sequence[PastRun]) -> str:
     tokens = [run.record.agent.tokens for run in runs]
     known = [each for each in tokens if each is not None]
     costs = [each.cost for each in known if each.cost is not None]
@@ -183,7 +183,7 @@ def _cost(runs: Sequence[Run]) -> str:
     return ", ".join(parts) + ("." if costs else "; no run records what its model cost.")
 
 
-_REMARKS: tuple[tuple[Callable[[Run], bool], str], ...] = (
+_REMARKS: tuple[tuple[Callable[[PastRun], bool], str], ...] = (
     (lambda run: run.record.outcome.status == "no_ok_submit", "have no working submit and rank last."),
     (lambda run: run.record.versions.env_deterministic is not True,
      "played an environment whose episodes are not confirmed to repeat."),

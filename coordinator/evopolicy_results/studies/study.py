@@ -27,7 +27,7 @@ from evopolicy_results.reading.environments import (
 )
 from evopolicy_results.reading.parallel import Processes
 from evopolicy_results.reading.reader import load_runs, rescored
-from evopolicy_results.reading.records import LeftOut, Run
+from evopolicy_results.reading.records import LeftOut, PastRun
 from evopolicy_results.scoring.evolution import Evolution, evolutions
 from evopolicy_results.scoring.scores import (
     Leaderboard,
@@ -61,7 +61,7 @@ class SuiteStatistics(msgspec.Struct, frozen=True, kw_only=True):
     """By entry, the mean normalised optimism over its environments; absent where there is none."""
 
 
-class Suite(msgspec.Struct, frozen=True, kw_only=True):
+class SuiteStudy(msgspec.Struct, frozen=True, kw_only=True):
     name: str
     table: ScoreTable
     board: Leaderboard
@@ -82,11 +82,11 @@ class Suite(msgspec.Struct, frozen=True, kw_only=True):
 class Study(msgspec.Struct, frozen=True, kw_only=True):
     """All metrics of a set of runs. `records.rows` turns each list of records into rows for a data frame."""
 
-    runs: tuple[Run, ...]
+    runs: tuple[PastRun, ...]
     left_out: tuple[LeftOut, ...]
     mixtures: tuple[Mixture, ...]
     """Differences between runs in settings that a comparison holds fixed; empty unless mixing was allowed."""
-    suites: tuple[Suite, ...]
+    suites: tuple[SuiteStudy, ...]
     evolutions: tuple[Evolution, ...]
     edit_rates: tuple[EditRates, ...]
     structure: tuple[StructureMean, ...]
@@ -122,7 +122,7 @@ class Study(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def study_of(
-    runs: Sequence[Run],
+    runs: Sequence[PastRun],
     *,
     left_out: Iterable[LeftOut] = (),
     allow_mixed: bool = False,
@@ -182,7 +182,7 @@ def study(
     return study_of(runs, left_out=loaded.left_out, allow_mixed=allow_mixed)
 
 
-def _suite(name: str, table: ScoreTable, runs: Sequence[Run], resamples: int) -> Suite:
+def _suite(name: str, table: ScoreTable, runs: Sequence[PastRun], resamples: int) -> SuiteStudy:
     board, environments, scales = leaderboard(table), table.environments, scales_of(table)
     compared = pairs(table.cells, table.entries, environments, resamples=resamples)
     means = {
@@ -192,7 +192,7 @@ def _suite(name: str, table: ScoreTable, runs: Sequence[Run], resamples: int) ->
     alone, against = aggregates(table.cells, board.agents, scales, resamples=resamples)
     general = generalisation((run for run in runs if run.env in set(environments)), scales)
     scores = {row.entry: row.score for row in board.standings}
-    return Suite(
+    return SuiteStudy(
         name=name,
         table=table,
         board=board,
@@ -211,7 +211,7 @@ def _suite(name: str, table: ScoreTable, runs: Sequence[Run], resamples: int) ->
     )
 
 
-def _in_order(runs: Sequence[Run]) -> list[Run]:
+def _in_order(runs: Sequence[PastRun]) -> list[PastRun]:
     place = {env: i for i, env in enumerate(ordered_environments(run.env for run in runs))}
     return sorted(runs, key=lambda run: (place[run.env], run.entry.casefold(), run.record.repeat, run.name))
 

@@ -10,7 +10,7 @@ from evopolicy_results.reading.environments import family_of, family_title, grou
 from evopolicy_results.scoring.evolution import Evolution
 from evopolicy_results.scoring.scores import DEMANDS, Cell, mean_of_all, on_known_scale
 from evopolicy_results.statistics.intervals import bounds_text, decimals
-from evopolicy_results.studies.study import Study, Suite
+from evopolicy_results.studies.study import Study, SuiteStudy
 from evopolicy_results.tables.run_tables import ENTRY, ENV, HARNESS, RUN, RUNS, one_or_all, tables_of_runs
 from evopolicy_results.tables.statistics_tables import OVER, checkpoints, starts_table, statistics_tables
 from evopolicy_results.tables.table import (
@@ -41,7 +41,7 @@ MEANS = frozenset({"leaderboard", "incomplete", "aggregates", "improvement", "no
 
 def tables_of(study: Study) -> list[Table]:
     """Every table of the report in order. Tables without rows are omitted, except for `left_out`."""
-    kinds: dict[str, list[tuple[Suite, Table]]] = {}
+    kinds: dict[str, list[tuple[SuiteStudy, Table]]] = {}
     for suite in study.suites:
         own = (_aggregate(suite, study), _incomplete(suite), _heldout(suite), _cells(suite))
         for table in (*own, *statistics_tables(suite), _normalised(suite)):
@@ -65,7 +65,7 @@ def tables_of(study: Study) -> list[Table]:
     return [table for table in tables if table.rows or table.name == "left_out"]
 
 
-def _aggregate(suite: Suite, study: Study) -> Table:
+def _aggregate(suite: SuiteStudy, study: Study) -> Table:
     families = list(dict.fromkeys(family_of(env) for env in suite.table.environments))
     # Families that do not ship could have the name of another column.
     keys = {each: each if each in catalogue.families() else f"family_{each}" for each in families}
@@ -146,7 +146,7 @@ def _aggregate(suite: Suite, study: Study) -> Table:
     )
 
 
-def _incomplete(suite: Suite) -> Table:
+def _incomplete(suite: SuiteStudy) -> Table:
     n = len(suite.table.environments)
     return tabulated(
         "incomplete",
@@ -165,7 +165,7 @@ def _incomplete(suite: Suite) -> Table:
     )
 
 
-def _heldout(suite: Suite) -> Table:
+def _heldout(suite: SuiteStudy) -> Table:
     rows: list[dict[str, object]] = []
     marks: dict[tuple[int, str], int] = {}
     digits: dict[tuple[int, str], int] = {}
@@ -196,7 +196,7 @@ def _heldout(suite: Suite) -> Table:
     )
 
 
-def _cells(suite: Suite) -> Table:
+def _cells(suite: SuiteStudy) -> Table:
     means = suite.statistics.means
 
     def over(cell: Cell) -> str | None:
@@ -233,7 +233,7 @@ def _cells(suite: Suite) -> Table:
     return replace(table, columns=tuple(c for c in table.columns if has.get(c.key, True)))
 
 
-def _normalised(suite: Suite) -> Table:
+def _normalised(suite: SuiteStudy) -> Table:
     agents = suite.table.agents
     cells = suite.normalised.cells
     groups = {(group.entry, group.demand): group for group in suite.normalised.groups}

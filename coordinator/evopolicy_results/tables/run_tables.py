@@ -23,7 +23,7 @@ from evopolicy_results.reading.environments import (
     ordered_environments,
     title_of,
 )
-from evopolicy_results.reading.records import Run, Submit, path_text
+from evopolicy_results.reading.records import PastRun, PastSubmit, path_text
 from evopolicy_results.studies.study import Study
 from evopolicy_results.tables.table import Column, Kind, Table, at, rows_of, tabulated
 
@@ -99,7 +99,7 @@ def _short(run: str) -> str:
     return run.rsplit(" / ", 1)[-1]
 
 
-def _journal(run: Run) -> str | None:
+def _journal(run: PastRun) -> str | None:
     """None for runs of the published software."""
     place = run.record.committed
     return None if place is None or place.ended is None else f"{place.ended} {place.ended_head[:16]}"
@@ -108,7 +108,7 @@ def _journal(run: Run) -> str | None:
 _LINE = "The weakest of a run and of those that it starts from."
 
 
-def _agents(runs: Iterable[Run]) -> Table:
+def _agents(runs: Iterable[PastRun]) -> Table:
     """One row per setup of an entry: several rows show that its runs differ."""
     version = "Of the harness's program."
     isolation = "exclusive: hidden episodes and agents never shared a kernel."
@@ -137,7 +137,7 @@ def _agents(runs: Iterable[Run]) -> Table:
     )
 
 
-def _settings(run: Run) -> str:
+def _settings(run: PastRun) -> str:
     """The plain settings on one line; lists and paths of the original machine are only in run.json."""
     texts: dict[type, Callable[[Any], Any]] = {bool: _YES_NO.get, float: "{:g}".format}
     return ", ".join(
@@ -149,13 +149,13 @@ def _settings(run: Run) -> str:
     )
 
 
-def _environments(runs: Iterable[Run]) -> Table:
+def _environments(runs: Iterable[PastRun]) -> Table:
     by_env = grouped(runs, lambda run: run.env)
 
-    def common(key: str, title: str, kind: Kind, of: Callable[[Run], object], note: str = "") -> Column:
+    def common(key: str, title: str, kind: Kind, of: Callable[[PastRun], object], note: str = "") -> Column:
         return Column(key, title, kind, note=note, of=lambda env: one_or_all(map(of, by_env[env])))
 
-    def dimension(name: str) -> Callable[[Run], object]:
+    def dimension(name: str) -> Callable[[PastRun], object]:
         return lambda run: getattr(run.record.experiment_dimensions, name) or None
 
     def spaces(env: str) -> str | None:
@@ -167,7 +167,7 @@ def _environments(runs: Iterable[Run]) -> Table:
     known = catalogue.entries()
     version = common("version", "Version", "text", lambda run: run.record.versions.env)
 
-    def repeats(run: Run) -> str:
+    def repeats(run: PastRun) -> str:
         return _YES_NO[run.record.versions.env_deterministic]
 
     note = "How long one policy object lives."
@@ -199,8 +199,8 @@ def _environments(runs: Iterable[Run]) -> Table:
 class _Of(NamedTuple):
     """A submit, with what its run's trace has of it."""
 
-    run: Run
-    submit: Submit
+    run: PastRun
+    submit: PastSubmit
     transition: Transition | None
     evidence: Evidence
 
@@ -252,7 +252,7 @@ def feedback_use(rows: Iterable[dict[str, object]]) -> Table:
     )
 
 
-def _audit_row(run: Run) -> dict[str, object]:
+def _audit_row(run: PastRun) -> dict[str, object]:
     record, submits, selected = run.record, run.submits, run.record.outcome.best_submit_index
     dimensions = record.experiment_dimensions
     not_ok = sum(submit.status != "ok" for submit in submits)
@@ -301,7 +301,7 @@ def _repaired_rate(transitions: object) -> float | None:
     return invalid / steps
 
 
-def _audit(runs: Iterable[Run]) -> Table:
+def _audit(runs: Iterable[PastRun]) -> Table:
     """Diagnostics: no score depends on them. Runs of the published software record only some of them."""
     repaired = "Share of the train steps whose action was outside the action space."
     splits = "`public`: of case files or a public seed that anybody may know."

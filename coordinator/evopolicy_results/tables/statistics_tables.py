@@ -12,7 +12,7 @@ from evopolicy_results.reading.environments import grouped, title_of
 from evopolicy_results.statistics.aggregates import LEAST_RUNS, TAUS
 from evopolicy_results.statistics.pairs import GAPS, MAX_REPEATS, Pair, least_runs
 from evopolicy_results.statistics.starts import StartGroup
-from evopolicy_results.studies.study import Suite
+from evopolicy_results.studies.study import SuiteStudy
 from evopolicy_results.tables.run_tables import ENTRY, ENV, RUNS
 from evopolicy_results.tables.table import (
     INTERVAL,
@@ -29,7 +29,7 @@ ENVIRONMENTS = Column("environments", "Environments", "integer", of="n_environme
 OVER = Column("over", "Over", note="Drawn anew in a repetition: cases, runs, or runs and cases.")
 
 
-def statistics_tables(suite: Suite) -> list[Table]:
+def statistics_tables(suite: SuiteStudy) -> list[Table]:
     """The tables in the order of the report; some may have no rows."""
     results = suite.statistics
     n_unpaired = sum(pair.n_left_out > 0 for pair in results.pairs)
@@ -114,7 +114,7 @@ def _above(tau: float) -> tuple[Column, Column]:
     return with_interval(key, f"Above {tau:g}", lambda one: one.profile[place], 2)
 
 
-def checkpoints(suite: Suite) -> str:
+def checkpoints(suite: SuiteStudy) -> str:
     """A caption's sentences where an agent has one run on an environment, or runs that returned the same policy; else
     empty."""
     cells = [cell for cell in suite.table.cells.values() if cell.fixed is None]
@@ -213,7 +213,7 @@ def starts_table(groups: Sequence[StartGroup]) -> Table:
     )
 
 
-def _resolution(suite: Suite) -> Table:
+def _resolution(suite: SuiteStudy) -> Table:
     gap, whole = suite.statistics.standings.gap, suite.statistics.overall
 
     def repeats(share: float) -> Column:
@@ -250,7 +250,7 @@ def _resolution(suite: Suite) -> Table:
     )
 
 
-def _generalisation(suite: Suite) -> Table:
+def _generalisation(suite: SuiteStudy) -> Table:
     columns = (
         ENV,
         ENTRY,

@@ -22,7 +22,7 @@ from evopolicy_common.records.blobs import digest_of
 from evopolicy_common.records.episodes.rendered import OBSERVATIONS, ROWS, checked_files
 from evopolicy_common.records.episodes.trajectory import Recorder, Row
 from evopolicy_worker.environments.interface import calls
-from evopolicy_worker.environments.interface.calls import USUAL, Limits
+from evopolicy_worker.environments.interface.calls import USUAL, EnvironmentLimits
 from evopolicy_worker.slot_protocol.begun import PackedBegun, pack
 from evopolicy_worker.slots.slot import Slot
 
@@ -104,7 +104,13 @@ def slot(slots: Slots) -> Iterator[Slot]:
     """One that plays all of them."""
     entries = tuple(each.entry for each in (*PLAYED, VARIES, *map(Odd, REFUSED)))
     by_id = {each.id: each for each in entries}
-    odd = Slot(None, "bwrap", slots.folder / "odd", definitions=(*by_id.values(),), limits=Limits(call_s=8.0))
+    odd = Slot(
+        None,
+        "bwrap",
+        slots.folder / "odd",
+        definitions=(*by_id.values(),),
+        limits=EnvironmentLimits(call_s=8.0),
+    )
     with slots.running(odd) as running:
         yield running
 
@@ -164,8 +170,8 @@ def test_an_odd_environment_is_refused_with_its_remedy(slots: Slots, slot: Slot,
 
 
 def test_a_close_has_a_limit_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
-    guard = calls.Guard(USUAL)
-    monkeypatch.setattr(calls, "current", calls.Call())
+    guard = calls.LimitGuard(USUAL)
+    monkeypatch.setattr(calls, "current", calls.RunningCall())
     calls.current.begin("my/env", "close")
     told = [guard.check(100.0 + second) for second in range(40)]
     assert told.index(calls.hung("environment my/env, close", calls.CLOSE_S)) == 31

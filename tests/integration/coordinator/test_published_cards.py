@@ -16,7 +16,7 @@ from publications import Forger, Held, Results
 from evopolicy_common.catalogue.installs import licences
 from evopolicy_results.publish import card as cards
 from evopolicy_results.publish import contents, descriptions, rules
-from evopolicy_results.publish.findings import Checked
+from evopolicy_results.publish.findings import Findings
 
 pytestmark = pytest.mark.system
 
@@ -40,13 +40,13 @@ def card_of(results: Results) -> cards.Card:
     return msgspec.json.decode(results.files[contents.CARD], type=cards.Card)
 
 
-def checked(results: Results, forger: Forger) -> Checked:
+def checked(results: Results, forger: Forger) -> Findings:
     """Signed by the publisher itself."""
     forger.sign(results.root / "st")
     return rules.check(Held(forger.files), results.summary["signer"])
 
 
-def states(result: Checked, kind: str = "card") -> list[str]:
+def states(result: Findings, kind: str = "card") -> list[str]:
     return [each.state for each in result.findings if each.kind == kind]
 
 

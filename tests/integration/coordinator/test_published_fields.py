@@ -18,7 +18,7 @@ import pytest
 from publications import Forger, Held, Results, spelt
 
 from evopolicy_results.publish import contents, fields, rules
-from evopolicy_results.publish.findings import Checked
+from evopolicy_results.publish.findings import Findings
 
 pytestmark = pytest.mark.system
 
@@ -52,13 +52,13 @@ def with_leaf(content: Any, path: tuple[str, ...]) -> Any:
     return content
 
 
-def checked(results: Results, forger: Forger) -> Checked:
+def checked(results: Results, forger: Forger) -> Findings:
     """As a reader who knows the signer's key and noted the journal's head at the end."""
     head = results.summary["journal_head"]
     return rules.check(Held(forger.files), results.summary["signer"], heads=[head])
 
 
-def claimed(outcome: Checked, file: str, path: tuple[str, ...]) -> bool:
+def claimed(outcome: Findings, file: str, path: tuple[str, ...]) -> bool:
     """Whether the output lists the field as a claim."""
     kind = (fields.file_kind(file) or "").removeprefix("runs/*/")
     begin = f"nobody can check, in {kind}: "
@@ -80,7 +80,7 @@ def in_manifest(results: Results, forger: Forger, file: str, digest: str) -> Non
     forger.sign_manifest(results.root / "st")
 
 
-def signed(results: Results, forger: Forger, file: str) -> Checked:
+def signed(results: Results, forger: Forger, file: str) -> Findings:
     """A forger cannot make digests anew that contradict the files: the manifest's own fields are signed as they are."""
     if file in (contents.MANIFEST, contents.SIGNATURE):
         if file == contents.MANIFEST:

@@ -107,7 +107,7 @@ async def test_an_ended_agents_gateway_closes_the_run_without_a_permit(tmp_path:
     async with prepared(tmp_path) as (folder, double):
         await double.score_another_run(proc.boot_id())
         gateway, _ = quiet(folder)
-        gateway.tell(child_messages.CloseRun(reason="agent_stopped"))
+        gateway.tell(child_messages.CloseGateway(reason="agent_stopped"))
         assert await gateway.run()
     assert double.closed is not None
 
@@ -125,7 +125,7 @@ async def test_a_remote_agents_run_closes_on_its_operators_word(tmp_path: Path) 
     async with prepared(tmp_path) as (folder, double):
         remote(folder, KERNEL)
         async with gateway_on(folder, double) as service:
-            service.gateway.tell(child_messages.CloseRun(reason="budget_spent"))
+            service.gateway.tell(child_messages.CloseGateway(reason="budget_spent"))
             await until(lambda: len(service.waits) > 1)
             assert "evopolicy finish" in service.waits[1]
             assert double.closed is None
@@ -147,7 +147,7 @@ async def test_a_gateway_stopped_before_its_agents_end_leaves_the_run_open(tmp_p
     async with prepared(tmp_path) as (folder, double):
         remote(folder, "")
         async with gateway_on(folder, double) as service:
-            service.gateway.tell(child_messages.CloseRun(reason="wall_limit"))
+            service.gateway.tell(child_messages.CloseGateway(reason="wall_limit"))
             await until(lambda: len(service.waits) > 1)
             service.gateway.tell(None)
             assert not await service.task

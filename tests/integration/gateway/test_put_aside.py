@@ -18,7 +18,7 @@ import pytest
 from gateway_double import Double, gateway_on, opened, packed_episode, prepared, served
 
 from evopolicy_common.records.episodes import rendered
-from evopolicy_common.records.open_run import Died, Refused
+from evopolicy_common.records.open_run import Died, SubmitRefused
 from evopolicy_gateway.run_folder.journal import Journal
 from evopolicy_gateway.run_folder.layout import RunFolder
 from evopolicy_gateway.submits import formatting
@@ -159,5 +159,5 @@ async def test_a_submit_ending_two_gateways_is_set_aside(
             assert (await s.http.get(f"{s.urls.submit}/submit_000")).status_code == 500
             assert (await s.http.get(f"{s.urls.submit}/submit_001")).status_code == 200
         journal = Journal(folder.journal)
-        assert sum(isinstance(entry, Refused) for entry in journal.entries.values()) == 1
+        assert sum(isinstance(entry, SubmitRefused) for entry in journal.entries.values()) == 1
         journal.close()

@@ -27,7 +27,7 @@ from evopolicy_coordinator.pki import identity
 from evopolicy_results.leaderboard.bundles import LabBundle, boards, read_bundles
 from evopolicy_results.publish import contents, rules
 from evopolicy_results.publish.archive import Archive
-from evopolicy_results.publish.findings import Checked
+from evopolicy_results.publish.findings import Findings
 from evopolicy_results.publish.replay import replay
 
 pytestmark = [pytest.mark.system, pytest.mark.timeout(900)]
@@ -166,7 +166,7 @@ class Labs:
     def bundles(self, number: int) -> list[LabBundle]:
         """As the command reads the files of a board, with every episode played again."""
 
-        def play(archive: Archive, checked: Checked) -> None:
+        def play(archive: Archive, checked: Findings) -> None:
             asyncio.run(replay(archive, checked, 1.0, lambda played, total: None))
 
         keys = {identity.public_key(self.root / lab): lab for lab in RUNS}

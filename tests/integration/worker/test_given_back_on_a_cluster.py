@@ -32,7 +32,7 @@ from evopolicy_coordinator.core.contract.records import BegunRow, OutcomeRow, su
 from evopolicy_worker.capabilities import Capabilities
 from evopolicy_worker.slot_protocol import begun
 from evopolicy_worker.slots.slot import Slot
-from evopolicy_worker.supervisor import Options, Supervisor
+from evopolicy_worker.supervisor import Supervisor, WorkerOptions
 
 CLOCKED = """
 import time
@@ -148,7 +148,7 @@ def test_a_policy_whose_workers_end_again_and_again_gets_one_throw(
     thrown: list[list[float]] = []
     place(tmp_path)
     monkeypatch.setenv("PYTHONPATH", str(tmp_path / "package"), prepend=os.pathsep)
-    options = Options(
+    options = WorkerOptions(
         name="w-1",
         slots=2,  # the random reference goes on as long
         fingerprint=FINGERPRINT,

@@ -44,7 +44,7 @@ from evopolicy_coordinator.cli.status import status_app
 from evopolicy_worker import capabilities, outbox, supervisor
 from evopolicy_worker.capabilities import Capabilities
 from evopolicy_worker.slot_protocol.begun import HandedBack
-from evopolicy_worker.supervisor import Options, Supervisor
+from evopolicy_worker.supervisor import Supervisor, WorkerOptions
 
 pytestmark = pytest.mark.slow
 
@@ -132,7 +132,7 @@ async def supervising(
     able: Capabilities | None = None,
 ) -> AsyncIterator[Supervisor]:
     """A supervisor that works in the background and is drained at the end. `able`: else every job can be played."""
-    options = Options(
+    options = WorkerOptions(
         name=name,
         slots=slots,
         fingerprint=FINGERPRINT,

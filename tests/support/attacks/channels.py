@@ -24,7 +24,7 @@ from slots import QUICK, Slots, make_job
 
 from evopolicy_gateway.jail.installs import needs_of
 from evopolicy_gateway.jail.jail import Way
-from evopolicy_gateway.jail.view import View
+from evopolicy_gateway.jail.view import JailView
 from evopolicy_worker.slots.slot import Slot
 
 PERIOD_S = 0.05
@@ -195,7 +195,7 @@ class JailedReader:
         workspace = folder / "workspace"
         (workspace / "feedback").mkdir(parents=True)
         self._folder = folder
-        self._view = View(
+        self._view = JailView(
             workspace=workspace,
             private=folder / "private",
             home="/home/agent",

@@ -12,7 +12,7 @@ from starlette.testclient import TestClient
 from evopolicy_common.messages.gateway import Submit, SubmitAccepted
 from evopolicy_common.messages.run_settings import RunSettings
 from evopolicy_common.messages.status import RunStatus, StatusReply, WorkerStatus
-from evopolicy_common.records.open_run import Requested
+from evopolicy_common.records.open_run import SubmitRequested
 from evopolicy_common.records.policies.bundles import BundleFile, pack
 from evopolicy_common.wire.credentials import Credentials
 from evopolicy_coordinator.web.access import Access
@@ -85,7 +85,7 @@ def open_run(
     (state / "intended.json").write_bytes(msgspec.json.encode({"key": "k", "settings": wanted, "run": run}))
     submit = Submit(key="one", env_instances=(0,), bundle=bundle.digest)
     accepted = SubmitAccepted(submit_index=0, first_global_episode=0, remaining_budget=127)
-    lines = [Requested(submit=submit, client_key=None, body_digest="d"), accepted]
+    lines = [SubmitRequested(submit=submit, client_key=None, body_digest="d"), accepted]
     (state / "journal.jsonl").write_bytes(b"".join(msgspec.json.encode(line) + b"\n" for line in lines))
     (folder / "logs").mkdir()
     (folder / "logs" / "agent.jsonl").write_text("".join(json.dumps(line) + "\n" for line in log or []))

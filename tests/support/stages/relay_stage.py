@@ -13,7 +13,7 @@ import httpx
 from evopolicy_common.wire.http import bound, serving
 from evopolicy_gateway.relay.apis import Protocol, Upstream
 from evopolicy_gateway.relay.limits import Used, read_ledger
-from evopolicy_gateway.relay.service import Order, Relay
+from evopolicy_gateway.relay.service import Relay, RelaySetup
 from stages.model_api import ModelApi, Step
 
 NOON = 1768564800.0
@@ -70,7 +70,7 @@ async def relay(
         base = f"{api.base_url}/v1" if protocol == "openai" else api.base_url
         given = {"base_url": base, "key": KEY, **more.pop("upstream", {})}
         upstream = Upstream(protocol=protocol, **given)
-        order = Order(upstream=upstream, token=TOKEN, ledger=str(served.ledger), **more)
+        order = RelaySetup(upstream=upstream, token=TOKEN, ledger=str(served.ledger), **more)
         app = Relay(
             order, counted=lambda: None, note=served.notes.append, spent=served.spent.append, now=lambda: NOON
         )

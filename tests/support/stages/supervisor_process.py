@@ -11,10 +11,10 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from evopolicy_gateway.processes import child_messages
-from evopolicy_gateway.processes.child_messages import Event, Order, StartAgent
+from evopolicy_gateway.processes.child_messages import FromChild, StartAgent, ToChild
 from evopolicy_gateway.run_folder.layout import RunFolder
 
-E = TypeVar("E", bound=Event)
+E = TypeVar("E", bound=FromChild)
 TIMEOUT_S = 60.0
 AGENT = "import os, time; open(os.path.join({folder!r}, str(os.getpid())), 'w').close(); time.sleep(1000)"
 
@@ -43,7 +43,7 @@ class SupervisorProcess:
         usual |= {"agent": agent or f"command:{sys.executable} {program}", "wall_limit_s": wall_limit_s}
         self.tell(StartAgent(**usual, **more))
 
-    def tell(self, order: Order) -> None:
+    def tell(self, order: ToChild) -> None:
         assert self.process.stdin is not None
         self.process.stdin.write(child_messages.line(order))
         self.process.stdin.flush()

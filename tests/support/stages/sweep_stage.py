@@ -19,7 +19,7 @@ from evopolicy_common.messages.run_settings import RunSettings
 from evopolicy_common.records.run_record import RunRecord
 from evopolicy_common.records.suite_folder import Index, SweepRun
 from evopolicy_common.wire.credentials import Credentials
-from evopolicy_gateway.operator.cluster import Cluster as LocalCluster
+from evopolicy_gateway.operator.cluster import ChosenCluster as LocalCluster
 from evopolicy_gateway.processes.child_messages import AgentDoing
 from evopolicy_gateway.run.plan import Plan
 from evopolicy_gateway.run_folder.layout import RunFolder

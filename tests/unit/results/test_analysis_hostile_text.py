@@ -69,7 +69,7 @@ def test_an_unforeseen_failure_spoils_one_page_alone(tmp_path: Path, monkeypatch
     write_run(tmp_path / "runs", VERSIONS, entry="Honest")
     real = writing.trace
 
-    def fails(run: writing.Run) -> Trace:
+    def fails(run: writing.PastRun) -> Trace:
         if run.entry == "Hostile":
             raise ArithmeticError("<b>unforeseen</b>")
         return real(run)
@@ -105,7 +105,7 @@ def test_any_exception_while_a_run_is_read_leaves_out_that_run(
     write_run(tmp_path, VERSIONS, entry="Honest")
     real = reader.read_run
 
-    def fails(folder: Path) -> reader.Run:
+    def fails(folder: Path) -> reader.PastRun:
         if "Hostile" in str(folder):
             raise OverflowError("x" * 100_000)
         return real(folder)

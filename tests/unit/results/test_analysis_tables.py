@@ -19,7 +19,7 @@ from evopolicy_results.figures.policies import wilson
 from evopolicy_results.figures.style import new_figure, svg_text
 from evopolicy_results.reading.agent_log import LogReading, read_agent_log
 from evopolicy_results.reading.reader import read_run
-from evopolicy_results.reading.records import Run
+from evopolicy_results.reading.records import PastRun
 from evopolicy_results.studies.study import study
 from evopolicy_results.tables.report_tables import tables_of
 from evopolicy_results.tables.table import Column, Table, best_marks, to_csv, to_markdown
@@ -146,7 +146,7 @@ def test_log_without_answers_or_times_is_not_guessed_into_place(tmp_path: Path) 
     assert reading.unplaced == ("I start simple.", "It is too slow.", "submit 2", "Back to work.")
 
 
-def read_lines(run: Run, *lines: bytes | dict[str, object]) -> LogReading:
+def read_lines(run: PastRun, *lines: bytes | dict[str, object]) -> LogReading:
     """The reading of an agent's log with these lines."""
     log = run.path / "agent.jsonl"
     log.write_bytes(b"\n".join(one if isinstance(one, bytes) else json.dumps(one).encode() for one in lines))

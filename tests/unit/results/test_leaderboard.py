@@ -17,7 +17,7 @@ from evopolicy_common.records import journal
 from evopolicy_common.records.run_record import Artifacts, decode_run_record
 from evopolicy_results.leaderboard import write
 from evopolicy_results.leaderboard.bundles import LabBundle, _compare_journals, _tell_apart, _unpack
-from evopolicy_results.publish.findings import Checked, PublishedRun
+from evopolicy_results.publish.findings import Findings, PublishedRun
 from evopolicy_results.reading.reader import read_run
 
 VERSIONS = [Version(policy(gain=1.0), (-200.0, -100.0), -180.0)]
@@ -30,7 +30,7 @@ def bundle(root: Path, signer: str, lab: str, *entries: str) -> LabBundle:
         read_run(write_run(root / f"{signer}-{n}", VERSIONS, entry=entry, run=f"{root.name}-{n}"))
         for n, entry in enumerate(entries)
     ]
-    return LabBundle(file="x.evp", sha256="", lab=lab, checked=Checked(signer=signer), runs=runs)
+    return LabBundle(file="x.evp", sha256="", lab=lab, checked=Findings(signer=signer), runs=runs)
 
 
 def entries(of: LabBundle) -> list[str]:

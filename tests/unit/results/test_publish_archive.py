@@ -22,7 +22,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from evopolicy_common.errors import ProtocolError
-from evopolicy_results.publish.archive import Archive, Writer
+from evopolicy_results.publish.archive import Archive, ArchiveWriter
 
 
 def plain(name: str, mode: int = 0o100644, extra: bytes = b"") -> zipfile.ZipInfo:
@@ -117,7 +117,7 @@ def test_a_huge_file_is_refused_before_it_is_read(tmp_path: Path) -> None:
 def test_written_files_are_read_back_and_are_the_same_each_time(tmp_path: Path) -> None:
     files = {"manifest.json": b"{}", "runs/0000/actions/train-000": b"\0\1\2", "runs/0000/salt": b""}
     for name in ("one", "two"):
-        writer = Writer(tmp_path / name)
+        writer = ArchiveWriter(tmp_path / name)
         for path, data in files.items():
             writer.add(path, data)
         writer.close()
@@ -157,7 +157,7 @@ def test_any_damage_is_read_as_it_was_or_refused(changes: list[tuple[int, bytes]
 
 
 def test_the_writer_makes_no_name_that_the_reader_refuses(tmp_path: Path) -> None:
-    writer = Writer(tmp_path / "out")
+    writer = ArchiveWriter(tmp_path / "out")
     with pytest.raises(ProtocolError, match="not the name"):
         writer.add("../x", b"")
     writer.close()

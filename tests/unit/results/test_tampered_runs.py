@@ -41,7 +41,7 @@ from evopolicy_common.records.run_difference import differences
 from evopolicy_common.records.run_record import Artifacts, encode_run_record
 from evopolicy_common.regular_files import NotThereError, read_regular
 from evopolicy_coordinator.web.content.run_detail import Detail
-from evopolicy_coordinator.web.content.run_folders import Reader
+from evopolicy_coordinator.web.content.run_folders import FolderReader
 from evopolicy_gateway.harbor import scores
 from evopolicy_gateway.run_folder.layout import RunFolder
 from evopolicy_results.publish.collect import find_runs
@@ -115,7 +115,7 @@ def _export(run: Path, whole: Path) -> None:
 
 
 def _web(run: Path, whole: Path) -> None:
-    reader = Reader([run.parents[2]])
+    reader = FolderReader([run.parents[2]])
     for facts in reader.read_runs(None, cluster_is_known=True).by_key.values():
         assert facts.path is not None
         detail = Detail(facts.path)

@@ -12,16 +12,16 @@ from types import SimpleNamespace
 
 import pytest
 
-from evopolicy_worker.check_env import MOST_MEMORY_MB, Checked, InASlot
+from evopolicy_worker.check_env import MOST_MEMORY_MB, CheckedEnvironment, InASlot
 from evopolicy_worker.environments.checks import conformance
 from evopolicy_worker.environments.checks.conformance import CheckResult
 
 CARTPOLE, PENDULUM = "gymnasium/CartPole-v1", "gymnasium/Pendulum-v1"
 
 
-def checked(env: str, memory_mb: int, fault: str = "") -> Checked:
+def checked(env: str, memory_mb: int, fault: str = "") -> CheckedEnvironment:
     played = CheckResult(env=env, digest="d", fresh=True, reused=True)
-    return Checked(played, played, InASlot(memory_mb=memory_mb, fault=fault))
+    return CheckedEnvironment(played, played, InASlot(memory_mb=memory_mb, fault=fault))
 
 
 def test_a_slot_that_needs_too_much_memory_is_a_fault() -> None:

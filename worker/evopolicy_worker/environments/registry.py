@@ -65,7 +65,7 @@ def make(env_id: str, *, render: bool = False, accelerations: bool | None = None
     if entry.adapter == "toy":
         from evopolicy_worker.environments.families import toy
 
-        kind = toy.Line if entry.id == "toy/line" else toy.Maze
+        kind = toy.MassOnLine if entry.id == "toy/line" else toy.Maze
         return kind(entry, render=render)
     family = family_of(entry)
     if not family.installed():

@@ -29,7 +29,7 @@ from evopolicy_worker import environments
 from evopolicy_worker.environments.interface import calls
 from evopolicy_worker.episodes.loop import JobPlayer, fault_of
 from evopolicy_worker.episodes.monitor import Monitor
-from evopolicy_worker.episodes.policies import CancelledJobError, Progress
+from evopolicy_worker.episodes.policies import CancelledJobError, RunningJob
 from evopolicy_worker.sandbox import env_jail, jail
 from evopolicy_worker.sandbox.zygote import Zygote
 from evopolicy_worker.slot_protocol import slot_messages as messages
@@ -58,7 +58,7 @@ class Channel:
         self._received += data
         return [messages.commands.decode(each) for each in messages.unframed(self._received)]
 
-    def send(self, message: messages.Message) -> None:
+    def send(self, message: messages.SlotMessage) -> None:
         self.send_frame(messages.framed(message))
 
     def send_frame(self, frame: bytes) -> None:
@@ -71,17 +71,17 @@ class Channel:
 class EnvProcess:
     """One slot's life: start, then job after job."""
 
-    def __init__(self, channel: Channel, commands: int, limits: calls.Limits) -> None:
+    def __init__(self, channel: Channel, commands: int, limits: calls.EnvironmentLimits) -> None:
         self._channel = channel
-        self._jobs = queue.SimpleQueue[tuple[messages.Play, Progress] | messages.Describe]()
-        self._bundle: messages.Files | None = None
-        self._progress: Progress | None = None
+        self._jobs = queue.SimpleQueue[tuple[messages.Play, RunningJob] | messages.Describe]()
+        self._bundle: messages.BundleFiles | None = None
+        self._progress: RunningJob | None = None
         self._last_report = (0.0, 0)
         self._limits = limits
-        self._guard = calls.Guard(limits)
+        self._guard = calls.LimitGuard(limits)
         self._monitor = Monitor(commands, self._take_commands, self._check_and_report)
 
-    def run(self, start: messages.Start, early: list[messages.Command]) -> None:
+    def run(self, start: messages.SlotStart, early: list[messages.Command]) -> None:
         if start.core is not None:
             with contextlib.suppress(OSError):
                 os.sched_setaffinity(0, {start.core})
@@ -104,7 +104,7 @@ class EnvProcess:
         self._take_commands(early)
         self._monitor.start()
         player.policies.prepare()
-        self._channel.send(messages.Ready())
+        self._channel.send(messages.SlotReady())
         while True:
             work = self._jobs.get()
             if isinstance(work, messages.Describe):
@@ -115,7 +115,7 @@ class EnvProcess:
             with contextlib.suppress(SandboxError, SlotDiedError):
                 player.policies.prepare()
 
-    def _play(self, player: JobPlayer, command: messages.Play, progress: Progress) -> bytes:
+    def _play(self, player: JobPlayer, command: messages.Play, progress: RunningJob) -> bytes:
         """Plays a job and returns its last frames, which wake the supervisor only once."""
         try:
             self._bundle = command.bundle or self._bundle
@@ -161,7 +161,7 @@ class EnvProcess:
             elif isinstance(command, messages.Play):
                 # From now on it can be cancelled, also before it is taken up.
                 self._last_report = 0.0, 0
-                self._progress = Progress()
+                self._progress = RunningJob()
                 # This is the monitor's own thread, which need not be woken for it.
                 self._monitor.ticking = True
                 self._jobs.put((command, self._progress))
@@ -192,7 +192,7 @@ def main() -> None:
     while not (received := channel.receive()):
         pass
     start, *early = received
-    if not isinstance(start, messages.Start):
+    if not isinstance(start, messages.SlotStart):
         sys.exit(f"the first command is {type(start).__name__}, not Start")
     try:
         EnvProcess(channel, commands, start.limits).run(start, early)

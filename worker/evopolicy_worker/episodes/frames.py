@@ -62,7 +62,7 @@ class BadReplyError(Exception):
 _Word = Annotated[str, msgspec.Meta(max_length=200)]
 
 
-class Report(msgspec.Struct, frozen=True):
+class PolicyException(msgspec.Struct, frozen=True):
     """The exception of the policy's own code, as its process reports it; the policy may have forged the text."""
 
     stage: _Word
@@ -74,7 +74,7 @@ class Report(msgspec.Struct, frozen=True):
     """Of an action that is too large: its bytes."""
 
 
-_report_decoder = msgspec.json.Decoder(Report)
+_report_decoder = msgspec.json.Decoder(PolicyException)
 
 
 def compile_writer(space: SpaceSchema) -> Writer:
@@ -237,7 +237,7 @@ def action(tag: int, payload: bytes, max_values: int = 1024) -> Any:
     return value
 
 
-def report(payload: bytes) -> Report:
+def report(payload: bytes) -> PolicyException:
     """The failure in a FAILED frame; BadReplyError when it is none."""
     try:
         return _report_decoder.decode(payload)

@@ -87,15 +87,15 @@ from evopolicy_worker.environments.interface.calls import current as call
 from evopolicy_worker.environments.interface.calls import described, note
 from evopolicy_worker.environments.interface.trial import solved
 from evopolicy_worker.episodes.monitor import Monitor
-from evopolicy_worker.episodes.policies import CancelledJobError, Policies, Progress
+from evopolicy_worker.episodes.policies import CancelledJobError, Policies, RunningJob
 from evopolicy_worker.episodes.policy_process import PolicyFailedError, PolicyProcess
 from evopolicy_worker.episodes.video import VideoRecorder
 from evopolicy_worker.sandbox.inside.policy_server import reset_floats
-from evopolicy_worker.sandbox.jail import Jail
+from evopolicy_worker.sandbox.jail import PolicyJail
 from evopolicy_worker.sandbox.zygote import Zygote
 from evopolicy_worker.slot_protocol import endings
 from evopolicy_worker.slot_protocol import slot_messages as messages
-from evopolicy_worker.slot_protocol.begun import Begun, Log, Returned, is_kept, unpack
+from evopolicy_worker.slot_protocol.begun import ActionLog, Returned, RunningEpisode, is_kept, unpack
 from evopolicy_worker.slot_protocol.endings import EndedFromOutsideError
 
 MAX_FAULT = 4000
@@ -120,17 +120,17 @@ _Tell = Callable[[bytes], None]
 class JobPlayer:
     """Plays jobs one after another with warm environments and a zygote."""
 
-    def __init__(self, zygote: Zygote, jail: Jail, monitor: Monitor, scratch: Path) -> None:
+    def __init__(self, zygote: Zygote, jail: PolicyJail, monitor: Monitor, scratch: Path) -> None:
         self.policies = Policies(zygote, jail, monitor, scratch)
         self._environments: OrderedDict[str, Environment] = OrderedDict()
         self._videos = VideoRecorder()
-        self._log = Log(scratch)
+        self._log = ActionLog(scratch)
 
     def play_job(
         self,
         job: Job,
-        files: messages.Files | None,
-        progress: Progress,
+        files: messages.BundleFiles | None,
+        progress: RunningJob,
         tell: _Tell,
         first: int = 0,
         failure: PolicyFailure | None = None,
@@ -158,7 +158,11 @@ class JobPlayer:
                     tell(frame)
                 if progress.cancelled:
                     raise CancelledJobError
-                begun = before[k].unpacked() if failure is None and k in before else Begun(failure=failure)
+                begun = (
+                    before[k].unpacked()
+                    if failure is None and k in before
+                    else RunningEpisode(failure=failure)
+                )
                 if is_kept(job):
                     progress.begun = k, begun
                 if job.bundle is not None:
@@ -196,7 +200,7 @@ class JobPlayer:
         return frame
 
     def _play(
-        self, k: int, job: Job, progress: Progress, tell: _Tell, begun: Begun
+        self, k: int, job: Job, progress: RunningJob, tell: _Tell, begun: RunningEpisode
     ) -> tuple[EpisodeOutcome, bytes, bytes]:
         """As `_Episode.play_episode`, from `begun` on; repeated after ends that are not the episode's own."""
         n_ends = 0
@@ -254,9 +258,9 @@ class _Episode:
     spec: EpisodeSpec
     environment: Environment
     policies: Policies
-    progress: Progress
+    progress: RunningJob
     tell: _Tell
-    begun: Begun
+    begun: RunningEpisode
     """The policy's earlier actions. It is asked for them again, but they remain; random ones follow a failure."""
     acted: bool = False
     """Whether an action of the policy's has reached the environment."""
@@ -450,7 +454,7 @@ def _replayed(codec: ActionCodec, actions: Sequence[Returned], then: Source | No
     return act
 
 
-def _asked(codec: ActionCodec, policy: PolicyProcess, begun: Begun) -> Source:
+def _asked(codec: ActionCodec, policy: PolicyProcess, begun: RunningEpisode) -> Source:
     """A policy's actions, which are added to `begun`. Raises PolicyFailedError."""
     earlier, n_earlier = _replayed(codec, begun.taken), len(begun.taken)
     ask, repair, take = policy.act, codec.repair, begun.add_action

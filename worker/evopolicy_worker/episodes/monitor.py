@@ -23,7 +23,7 @@ from typing import NamedTuple
 
 from evopolicy_common.messages.episode import FailureCategory, ResourceLimits
 from evopolicy_common.processes import proc
-from evopolicy_worker.sandbox.zygote import Child
+from evopolicy_worker.sandbox.zygote import ForkedPolicy
 
 TICK_S = 0.1
 """How often limits are checked while a policy works, seconds; sooner when one is near."""
@@ -39,7 +39,7 @@ STOPPED = ("T", "t")
 _PIECE = 65536
 
 
-class Verdict(NamedTuple):
+class ExceededLimit(NamedTuple):
     """The limit that a policy was ended for."""
 
     category: FailureCategory
@@ -79,7 +79,7 @@ class Watch:
     """The watched values of one policy process. The episode loop writes the times, the monitor reads them."""
 
     def __init__(
-        self, child: Child, limits: ResourceLimits, *, count_threads: bool, held: bool = False
+        self, child: ForkedPolicy, limits: ResourceLimits, *, count_threads: bool, held: bool = False
     ) -> None:
         """`held`: whether only others can stop it."""
         self.child = child
@@ -94,7 +94,7 @@ class Watch:
         self.spent_s = 0.0
         """Its earlier wall time in this episode."""
         self.cpu_start_s = 0.0
-        self.verdict: Verdict | None = None
+        self.verdict: ExceededLimit | None = None
         self.stopped = False
         """Whether it was ended because it stood stopped."""
         self._held = held
@@ -152,21 +152,21 @@ class Watch:
         remaining_answer_s = self.answer_limit_s - running
         remaining_episode_s = limits.episode_wall_s - in_episode
         cpu = self.cpu_s() - self.cpu_start_s
-        verdict: Verdict | None = None
+        verdict: ExceededLimit | None = None
         if remaining_answer_s <= 0:
             text, most = f"{self.what} took longer than {self.answer_limit_s:g} s", self.answer_limit_s
-            verdict = Verdict("act_timeout", text, most, running)
+            verdict = ExceededLimit("act_timeout", text, most, running)
         elif remaining_episode_s <= 0:
             text = f"the policy worked for longer than {limits.episode_wall_s:g} s in this episode"
-            verdict = Verdict("episode_timeout", text, limits.episode_wall_s, in_episode)
+            verdict = ExceededLimit("episode_timeout", text, limits.episode_wall_s, in_episode)
         elif cpu > limits.cpu_s:
             text = f"the policy used more than {limits.cpu_s:g} s of CPU time in this episode"
-            verdict = Verdict("cpu_limit", text, limits.cpu_s, cpu)
+            verdict = ExceededLimit("cpu_limit", text, limits.cpu_s, cpu)
         elif self._count_threads:
             n = proc.number(f"/proc/{self.child.host_pid}/status", "Threads") or 0
             if n > limits.processes:
                 text = f"the policy had {n} threads; {limits.processes} are the limit"
-                verdict = Verdict("process_limit", text, limits.processes, n)
+                verdict = ExceededLimit("process_limit", text, limits.processes, n)
         if verdict is not None and self.since == since:
             self.verdict = verdict
             self.child.kill()

@@ -21,15 +21,15 @@ from evopolicy_common.processes.scratch import remove_tree
 from evopolicy_worker.environments import Environment
 from evopolicy_worker.episodes.monitor import Monitor
 from evopolicy_worker.episodes.policy_process import (
-    Ended,
+    PolicyEnd,
     PolicyFailedError,
     PolicyProcess,
     oom_kills,
 )
-from evopolicy_worker.sandbox.jail import Jail
-from evopolicy_worker.sandbox.zygote import Child, Zygote
+from evopolicy_worker.sandbox.jail import PolicyJail
+from evopolicy_worker.sandbox.zygote import ForkedPolicy, Zygote
 from evopolicy_worker.slot_protocol import slot_messages as messages
-from evopolicy_worker.slot_protocol.begun import Begun
+from evopolicy_worker.slot_protocol.begun import RunningEpisode
 
 MAX_CODES = 8
 """Policies whose compiled code is kept, at most 1 MiB each."""
@@ -42,7 +42,7 @@ class CancelledJobError(Exception):
     """The job was cancelled while it ran."""
 
 
-class Progress:
+class RunningJob:
     """Progress of the running job; written by the loop, read by the monitor's thread, which hears of a
     cancellation."""
 
@@ -51,12 +51,12 @@ class Progress:
         self.steps = 0
         self.cancelled = False
         self.policy: PolicyProcess | None = None
-        self.begun: tuple[int, Begun] | None = None
+        self.begun: tuple[int, RunningEpisode] | None = None
         """The running episode, with its index in the job, that is reported when the job is stopped."""
         self._given_up = False
         self._lock = threading.Lock()
 
-    def give_up(self, send: Callable[[messages.Message], None] | None) -> None:
+    def give_up(self, send: Callable[[messages.SlotMessage], None] | None) -> None:
         """Reports the started episode, once; the report is sent when this returns. With None, nothing more is
         reported."""
         with self._lock:
@@ -65,11 +65,11 @@ class Progress:
                 send(messages.Begun(place=place, begun=begun.packed()))
             self._given_up = True
 
-    def report(self, send: Callable[[messages.Message], None]) -> None:
+    def report(self, send: Callable[[messages.SlotMessage], None]) -> None:
         """Reports episodes and steps; nothing once the job was given up, since its last answer may have been sent."""
         with self._lock:
             if not self._given_up:
-                send(messages.Progress(episodes_done=self.episodes_done, steps=self.steps))
+                send(messages.JobProgress(episodes_done=self.episodes_done, steps=self.steps))
 
     def cancel(self) -> None:
         """Ends the running job at the next step, and the policy at once."""
@@ -82,12 +82,12 @@ class Progress:
 class Policies:
     """The policy of each episode: its own, or one for several of a job. Removes its files at the end."""
 
-    def __init__(self, zygote: Zygote, jail: Jail, monitor: Monitor, scratch: Path) -> None:
+    def __init__(self, zygote: Zygote, jail: PolicyJail, monitor: Monitor, scratch: Path) -> None:
         self._zygote = zygote
         self._jail = jail
         self._monitor = monitor
         self._scratch = scratch
-        self._prepared: Child | None = None
+        self._prepared: ForkedPolicy | None = None
         self._policy: PolicyProcess | None = None
         self._codes: dict[bytes, bytes] = {}
         self._n_policies = 0
@@ -100,7 +100,7 @@ class Policies:
             self._prepared = self._spawn()
 
     def begin_job(
-        self, job: Job, files: messages.Files | None, environment: Environment, progress: Progress
+        self, job: Job, files: messages.BundleFiles | None, environment: Environment, progress: RunningJob
     ) -> None:
         """The policies of this job come from now on. `files`: its bundle."""
         self._job, self._files, self._progress = job, files, progress
@@ -137,11 +137,11 @@ class Policies:
         policy.load(code)
         return policy
 
-    def release(self) -> Ended:
+    def release(self) -> PolicyEnd:
         """The policy's output in the ended episode; a policy for one episode ends with it."""
         policy = self._policy
         if policy is None:
-            return Ended(b"", b"", 0.0)
+            return PolicyEnd(b"", b"", 0.0)
         if self._job.policy_scope == "submit" and not policy.dead:
             ended = policy.take_output()
             if not policy.dead:
@@ -170,7 +170,7 @@ class Policies:
         self._progress.policy = PolicyProcess(self._zygote, child, self._monitor, self._jail, *own)
         return self._progress.policy
 
-    def _spawn(self) -> Child:
+    def _spawn(self) -> ForkedPolicy:
         """A process for the next policy, once those of the policies so far are gone with their folders."""
         self._zygote.bury()
         while self._folders:

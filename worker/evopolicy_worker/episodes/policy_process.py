@@ -24,11 +24,11 @@ from evopolicy_common.messages.episode import FailureCategory, PolicyFailure, Re
 from evopolicy_common.processes import proc
 from evopolicy_common.processes.packages import SIMULATORS
 from evopolicy_worker.episodes import frames
-from evopolicy_worker.episodes.monitor import STOPPED_S, Monitor, Verdict, Watch
+from evopolicy_worker.episodes.monitor import STOPPED_S, ExceededLimit, Monitor, Watch
 from evopolicy_worker.sandbox import zygote as zygotes
 from evopolicy_worker.sandbox.inside import policy_server
-from evopolicy_worker.sandbox.jail import Jail
-from evopolicy_worker.sandbox.zygote import Child, Exit, Zygote, wait_dead
+from evopolicy_worker.sandbox.jail import PolicyJail
+from evopolicy_worker.sandbox.zygote import Exit, ForkedPolicy, Zygote, wait_dead
 from evopolicy_worker.slot_protocol import endings
 from evopolicy_worker.slot_protocol import slot_messages as messages
 from evopolicy_worker.slot_protocol.endings import EndedFromOutsideError, Ending
@@ -91,7 +91,7 @@ class PolicyFailedError(Exception):
         self.failure = failure
 
 
-class Ended(NamedTuple):
+class PolicyEnd(NamedTuple):
     """A policy's output and processor time, seconds, when it or its episode ends."""
 
     stdout: bytes
@@ -105,9 +105,9 @@ class PolicyProcess:
     def __init__(
         self,
         zygote: Zygote,
-        child: Child,
+        child: ForkedPolicy,
         monitor: Monitor,
-        jail: Jail,
+        jail: PolicyJail,
         limits: ResourceLimits,
         folder: str,
         oom_kills: int | None = None,
@@ -132,7 +132,7 @@ class PolicyProcess:
         self._surplus_bytes = 0
         self._exit: Exit | None = None
         self._gone = False
-        self._finished: Ended | None = None
+        self._finished: PolicyEnd | None = None
         self._closing = threading.Lock()
         self._requests = child.requests
         self._replies = child.replies
@@ -144,7 +144,9 @@ class PolicyProcess:
 
         Only Python's compiler reads it here: this process runs none of it.
         """
-        self.seal(messages.Files([("policy.py", False, len(source))], source), bytes(16), env_meta, "arrays")
+        self.seal(
+            messages.BundleFiles([("policy.py", False, len(source))], source), bytes(16), env_meta, "arrays"
+        )
         try:
             return self._request(policy_server.COMPILE, "init", self._limits.init_wall_s)
         except PolicyFailedError:
@@ -161,7 +163,7 @@ class PolicyProcess:
 
     def seal(
         self,
-        bundle: messages.Files,
+        bundle: messages.BundleFiles,
         seed: bytes,
         env_meta: dict[str, Any],
         observations: str,
@@ -239,7 +241,7 @@ class PolicyProcess:
                 raise self._broken(str(error)) from None
         raise self._reported_failure(tag, payload, "act")
 
-    def take_output(self) -> Ended:
+    def take_output(self) -> PolicyEnd:
         """Output and CPU time of the episode that ends; the policy lives on when it can.
 
         EndedFromOutsideError when it was ended so: the policy of the episodes to come is lost.
@@ -253,13 +255,13 @@ class PolicyProcess:
         self._monitor.watch(self._watch)
         return ended
 
-    def _output(self, cpu_s: float) -> Ended:
+    def _output(self, cpu_s: float) -> PolicyEnd:
         # From here on no other thread reads it.
         self._monitor.watch(None)
         self._watch.drain()
-        return Ended(self._watch.stdout.take_output(), self._watch.stderr.take_output(), cpu_s)
+        return PolicyEnd(self._watch.stdout.take_output(), self._watch.stderr.take_output(), cpu_s)
 
-    def end(self) -> Ended:
+    def end(self) -> PolicyEnd:
         """End the process, if it has not ended, and collect what it leaves."""
         if self._finished is None:
             if not self.dead:
@@ -411,14 +413,14 @@ class PolicyProcess:
         _, _, limit, used = verdict or (None, None, None, None)
         return self._failed(self._fatal(category), text, "", limit, used)
 
-    def _limit_of(self, exit_: Exit) -> Verdict | None:
+    def _limit_of(self, exit_: Exit) -> ExceededLimit | None:
         """The limit for which the system ended it."""
         limits, cpu_s = self._limits, self._cpu_of_episode()
         if not os.WIFSIGNALED(exit_.status):
             return None
         if cpu_s > limits.cpu_s:
             text = f"the policy used more than {limits.cpu_s:g} s of CPU time"
-            return Verdict("cpu_limit", text, limits.cpu_s, cpu_s)
+            return ExceededLimit("cpu_limit", text, limits.cpu_s, cpu_s)
         held = exit_.peak_bytes - self._base_resident
         large = endings.how(exit_.status) == "SIGKILL" and held > _LARGE_SHARE * limits.memory_bytes
         if large and ((counted := oom_kills()) is None or counted != self._oom_kills):
@@ -426,7 +428,7 @@ class PolicyProcess:
                 f"the system ended the policy for want of memory: it held {held:,} bytes besides Python's own;"
                 f" {limits.memory_bytes:,} are the limit"
             )
-            return Verdict("oom", text, limits.memory_bytes, held)
+            return ExceededLimit("oom", text, limits.memory_bytes, held)
         return None
 
     def _fatal(self, category: FailureCategory) -> FailureCategory:

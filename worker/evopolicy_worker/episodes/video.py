@@ -11,8 +11,8 @@ Rules:
   keeps its outcome without a video, and a note on standard error gives the reason.
 - The process renders one environment only, since a second one with MuJoCo's renderer has crashed processes.
   It is the slot's child: pinned to the same core, and ended with the slot.
-- One episode at a time: a framed `Order` on standard input, a framed `Made` on the original standard output. Output of
-  simulators and drivers goes to standard error.
+- One episode at a time: a framed `VideoOrder` on standard input, a framed `MadeVideo` on the original standard output.
+  Output of simulators and drivers goes to standard error.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ EPISODE_S = 10
 """Target duration of the video of a full-length episode, seconds, if the frame rates allow it."""
 
 
-class Order(msgspec.Struct, frozen=True, kw_only=True):
+class VideoOrder(msgspec.Struct, frozen=True, kw_only=True):
     """The episode to record."""
 
     case: Case
@@ -67,7 +67,7 @@ class Order(msgspec.Struct, frozen=True, kw_only=True):
     """`trajectory` codec bytes with record "actions": the repaired actions and their results."""
 
 
-class Made(msgspec.Struct, frozen=True, kw_only=True):
+class MadeVideo(msgspec.Struct, frozen=True, kw_only=True):
     mp4: bytes | None
     error: str = ""
     """Why there is no video."""
@@ -105,9 +105,9 @@ class VideoRecorder:
             return None
         deadline = time.monotonic() + min(MAX_S, self._start_s + self._frame_s * length)
         try:
-            made = self._ask(env, framed(Order(case=case, actions=actions)), deadline, cancelled)
+            made = self._ask(env, framed(VideoOrder(case=case, actions=actions)), deadline, cancelled)
         except (OSError, WorkerError) as error:
-            made = Made(mp4=None, error=str(error))
+            made = MadeVideo(mp4=None, error=str(error))
         if made is not None and made.mp4 is not None:
             self._failures[env] = 0
             return made.mp4
@@ -129,7 +129,9 @@ class VideoRecorder:
                 assert pipe is not None
                 pipe.close()
 
-    def _ask(self, env: str, order: bytes, deadline: float, cancelled: Callable[[], bool]) -> Made | None:
+    def _ask(
+        self, env: str, order: bytes, deadline: float, cancelled: Callable[[], bool]
+    ) -> MadeVideo | None:
         """The process's answer; None when cancelled. Raises OSError, or WorkerError when the process ends or times
         out."""
         if self._env != env:
@@ -162,7 +164,7 @@ class VideoRecorder:
                 if not piece:
                     raise WorkerError(f"the process that draws it ended with status {process.wait()}")
                 received += piece
-        return msgspec.msgpack.decode(answers[0], type=Made)
+        return msgspec.msgpack.decode(answers[0], type=MadeVideo)
 
     def _note(self, text: str) -> None:
         """Prints each note once per slot."""
@@ -228,18 +230,18 @@ def serve(env_id: str, orders: BinaryIO, replies: BinaryIO) -> None:
     """Record one episode after another until there are no more orders."""
     environment: Environment | None = None
     while head := orders.read(LENGTH.size):
-        order = msgspec.msgpack.decode(orders.read(LENGTH.unpack(head)[0]), type=Order)
+        order = msgspec.msgpack.decode(orders.read(LENGTH.unpack(head)[0]), type=VideoOrder)
         try:
             if environment is None:
                 environment = environments.make(env_id, render=True)
             # By the environment alone, so that its videos run side by side.
             rate = environment.description.max_episode_steps // EPISODE_S
             rate = max(MIN_RATE, min(MAX_RATE, rate))
-            made = Made(mp4=encoded(replay(environment, order.case, order.actions), rate))
+            made = MadeVideo(mp4=encoded(replay(environment, order.case, order.actions), rate))
         except Exception as error:
             # Drivers and simulators raise any exception here, and a missing picture is no failure of the episode.
             why = str(error) if isinstance(error, WorkerError) else f"{type(error).__name__}: {error}"
-            made = Made(mp4=None, error=why)
+            made = MadeVideo(mp4=None, error=why)
         replies.write(framed(made))
         replies.flush()
 

@@ -70,7 +70,7 @@ class _PythonFiles(msgspec.Struct, frozen=True, kw_only=True):
     """Modules, packages and their bundled libraries: name in the packages folder → path on this machine."""
 
 
-class Jail(msgspec.Struct, frozen=True, kw_only=True):
+class PolicyJail(msgspec.Struct, frozen=True, kw_only=True):
     """A command that starts a zygote, and the zygote's configuration."""
 
     command: tuple[str, ...]
@@ -89,7 +89,7 @@ def plan(
     *,
     sealed: bool = True,
     user: int | None = None,
-) -> Jail:
+) -> PolicyJail:
     """The jail of that tier. Raises SandboxError, with a remedy, when this machine cannot build it.
 
     `user`: as root, the user id outside of the sandbox's user; None picks one (`some_user`). `sealed=False` omits what
@@ -125,7 +125,7 @@ def plan(
             (libraries if path in files.libraries else folders).append(_shown_at(path))
         folders += [f"{_PACKAGES}/{name}" for name, path in files.packages.items() if os.path.isdir(path)]
         config |= {"folders": [*folders, "/sandbox"], "libraries": libraries, "place": _PLACE}
-        return Jail(
+        return PolicyJail(
             command=(*_bubblewrap(files, as_root), *_python(files, "/sandbox")),
             config=config,
             user=(some_user() if user is None else user) if as_root else None,
@@ -139,7 +139,7 @@ def plan(
             )
         places = [*files.read, *files.packages.values(), str(config["packages"]), str(INSIDE)]
         config["landlock"] = {"read": places, "write": list(_DEVICES)}
-    return Jail(command=_python(files, str(INSIDE)), config=config, user=None, home=None)
+    return PolicyJail(command=_python(files, str(INSIDE)), config=config, user=None, home=None)
 
 
 def some_user() -> int:

@@ -24,7 +24,7 @@ import msgspec
 
 from evopolicy_common.errors import SandboxError, SlotDiedError
 from evopolicy_common.processes import proc
-from evopolicy_worker.sandbox.jail import START, Jail
+from evopolicy_worker.sandbox.jail import START, PolicyJail
 
 START_TIMEOUT_S = 60.0
 ANSWER_TIMEOUT_S = 20.0
@@ -34,7 +34,7 @@ _REPORT = struct.Struct("8xi12xi100x5q")
 """Code and status from `siginfo_t` (128 bytes); user and system time and peak memory from `struct rusage`."""
 
 
-class Child(msgspec.Struct):
+class ForkedPolicy(msgspec.Struct):
     """A forked policy process, and our ends of its pipes."""
 
     host_pid: int
@@ -76,10 +76,10 @@ class Exit(msgspec.Struct, frozen=True, kw_only=True):
 class Zygote:
     """One running zygote. Not thread-safe."""
 
-    def __init__(self, jail: Jail, scratch: Path) -> None:
+    def __init__(self, jail: PolicyJail, scratch: Path) -> None:
         """Starts the zygote and waits until it can fork. Raises SandboxError, with the output of bubblewrap or Python,
         when it cannot."""
-        self._dying: list[Child] = []
+        self._dying: list[ForkedPolicy] = []
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         ours.settimeout(START_TIMEOUT_S)
         with tempfile.TemporaryFile(dir=scratch) as output:
@@ -112,7 +112,7 @@ class Zygote:
             self.close()
             raise
 
-    def spawn(self) -> Child:
+    def spawn(self) -> ForkedPolicy:
         """Forks a policy process. Raises SlotDiedError when the zygote is gone, SandboxError when it cannot make a
         process."""
         try:
@@ -123,7 +123,7 @@ class Zygote:
             raise SlotDiedError(f"the sandbox's zygote is gone: {error}") from error
         if len(fds) != 5:
             raise SandboxError(f"cannot create the policy's process: {reply.decode('utf-8', 'replace')}")
-        return Child(pid_of(fds[0]), *fds)
+        return ForkedPolicy(pid_of(fds[0]), *fds)
 
     def _ask(self, request: bytes, *fds: int) -> tuple[bytes, list[int]]:
         """The answer to a request with these descriptors, and the descriptors in it. Raises OSError."""
@@ -134,7 +134,7 @@ class Zygote:
                 socket.send_fds(self._control, [request], [*fds, theirs.fileno()])
             return socket.recv_fds(ours, _MAX_MESSAGE, 5, socket.MSG_CMSG_CLOEXEC)[:2]
 
-    def wait(self, child: Child) -> Exit:
+    def wait(self, child: ForkedPolicy) -> Exit:
         """Reaps a child that was killed or has ended. Raises SlotDiedError when the zygote does not reply."""
         try:
             report, _ = self._ask(b"w", child.pidfd)
@@ -146,7 +146,7 @@ class Zygote:
         cpu_s = user_s + system_s + (user_us + system_us) / 1e6
         return Exit(status=status, cpu_s=cpu_s, peak_bytes=peak * 1024)
 
-    def bury_later(self, child: Child) -> None:
+    def bury_later(self, child: ForkedPolicy) -> None:
         """Kills the child now; `bury` reaps it later, because the kernel takes milliseconds to tear a process down."""
         child.kill()
         self._dying.append(child)
@@ -171,7 +171,7 @@ class Zygote:
         self._process.kill()
         self._process.wait()
 
-    def _wait_until_ready(self, jail: Jail) -> None:
+    def _wait_until_ready(self, jail: PolicyJail) -> None:
         while True:
             data, fds, _, _ = socket.recv_fds(self._control, _MAX_MESSAGE, 4, socket.MSG_CMSG_CLOEXEC)
             answer = json.loads(data) if data else {"error": "it closed its end"}

@@ -41,13 +41,13 @@ Returned = tuple[Any, Any]
 repair."""
 
 
-class Begun:
+class RunningEpisode:
     """A running episode; the monitor's thread may read it meanwhile."""
 
     def __init__(self, taken: list[Returned] | None = None, failure: PolicyFailure | None = None) -> None:
         self.taken: list[Returned] = [] if taken is None else taken
         self.failure = failure
-        self.log: Log | None = None
+        self.log: ActionLog | None = None
 
     def add_action(self, returned: Any, action: Any) -> None:
         """Adds an action, before it reaches the environment."""
@@ -85,19 +85,19 @@ class PackedBegun(msgspec.Struct, frozen=True, kw_only=True):
     """`trajectory` codec bytes, of which the actions count."""
     failure: PolicyFailure | None = None
     more: tuple[bytes, ...] = ()
-    """The actions after those, as `Log` adds them, of an episode whose process has ended."""
+    """The actions after those, as `ActionLog` adds them, of an episode whose process has ended."""
 
-    def unpacked(self) -> Begun:
+    def unpacked(self) -> RunningEpisode:
         """The episode to continue; empty when the bytes of another worker cannot be read."""
         try:
             rows = decode(self.actions).rows() if self.actions else ()
             taken = [row.action for row in rows] + [columns.decoder.decode(each) for each in self.more]
         except (ProtocolError, *DECODE_ERRORS, ValueError, TypeError, OverflowError, MemoryError):
-            return Begun()
-        return Begun([(action, action) for action in taken], self.failure)
+            return RunningEpisode()
+        return RunningEpisode([(action, action) for action in taken], self.failure)
 
 
-class Log:
+class ActionLog:
     """The file of the running episode: its head, then each further action. Mapped, as a system call for each step would
     take longer. If the disk is full, it has the first actions only."""
 
@@ -111,13 +111,13 @@ class Log:
         self._at, self._full = 0, False
         self._job, self._place = "", 0
 
-    def begins(self, job: str, place: int, begun: Begun) -> None:
+    def begins(self, job: str, place: int, begun: RunningEpisode) -> None:
         """The job's episode at this index begins; the file has it from now on."""
         self._job, self._place = job, place
         begun.log = self
         self.write(begun)
 
-    def write(self, begun: Begun) -> None:
+    def write(self, begun: RunningEpisode) -> None:
         """Writes the episode anew."""
         self._at, self._full = 0, False
         self.append(_frame(_encoder.encode((self._job, self._place, begun.packed()))))
@@ -143,7 +143,7 @@ class Log:
 
 
 def _frame(data: bytes) -> bytes:
-    """A frame of `Log`, with the file's end after it."""
+    """A frame of `ActionLog`, with the file's end after it."""
     return _LENGTH.pack(len(data)) + data + _END
 
 
@@ -161,7 +161,7 @@ def _array_head(dtype: np.dtype[Any], shape: tuple[int, ...]) -> bytes:
 
 
 def _frames(data: bytes) -> Iterator[bytes]:
-    """The parts of a `Log`, up to its end."""
+    """The parts of a `ActionLog`, up to its end."""
     at = 0
     while len(data) - at >= _LENGTH.size and (n := _LENGTH.unpack_from(data, at)[0]):
         at += _LENGTH.size
@@ -194,7 +194,7 @@ _Places = dict[int, PackedBegun]
 _encoder = msgspec.msgpack.Encoder()
 _decoder = msgspec.msgpack.Decoder(_Places)
 _head = msgspec.msgpack.Decoder(tuple[str, int, PackedBegun])
-"""The first part of a `Log`: job, index in it, and the episode so far."""
+"""The first part of a `ActionLog`: job, index in it, and the episode so far."""
 
 
 def is_kept(job: Job) -> bool:

@@ -55,7 +55,7 @@ class Ending(NamedTuple):
     job."""
 
 
-class Row(NamedTuple):
+class EndingRule(NamedTuple):
     """A kind of ending and its verdict. None in a condition matches anything."""
 
     name: str
@@ -82,23 +82,23 @@ _FROM_OUTSIDE: tuple[How, ...] = (*_KILLED, "signal", "pipe", "frame")
 _SEALED = "killed or stopped, sealed, and no limit explains it"
 _OPEN = "killed or stopped where it can signal itself"
 _OVERRAN_AGAIN = "the environment overran on its actions, as in earlier attempts"
-TABLE: tuple[Row, ...] = (
-    Row("a policy's process before the bundle's code", "policy", None, "outside", began=False),
-    Row("a limit was passed", "policy", None, "limit", limit=True, began=True),
-    Row("it exited", "policy", ("exit",), "killed", limit=False, began=True),
-    Row("it crashed", "policy", ("fault",), "killed", limit=False, began=True),
-    Row("a signal that it can send itself", "policy", ("signal",), "killed", limit=False, began=True),
-    Row("it closed its pipe", "policy", ("pipe",), "killed", limit=False, began=True),
-    Row("it broke the pipes' rules", "policy", ("frame",), "killed", limit=False, began=True),
-    Row(_OPEN, "policy", _KILLED, "killed", limit=False, began=True, held=False),
-    Row(_SEALED, "policy", _KILLED, "outside", limit=False, began=True, held=True),
-    Row("bubblewrap or the zygote", "sandbox", None, "outside"),
-    Row("the environment crashed on its actions", "environment", _CRASH, "killed", began=True),
-    Row("the environment crashed before any", "environment", _CRASH, "outside", began=False),
-    Row(_OVERRAN_AGAIN, "environment", ("overrun",), "killed", again=True),
-    Row("the environment overran", "environment", ("overrun",), "outside", again=False),
-    Row("the environment was killed or stopped", "environment", _FROM_OUTSIDE, "outside"),
-    Row("the worker", "supervisor", None, "outside"),
+TABLE: tuple[EndingRule, ...] = (
+    EndingRule("a policy's process before the bundle's code", "policy", None, "outside", began=False),
+    EndingRule("a limit was passed", "policy", None, "limit", limit=True, began=True),
+    EndingRule("it exited", "policy", ("exit",), "killed", limit=False, began=True),
+    EndingRule("it crashed", "policy", ("fault",), "killed", limit=False, began=True),
+    EndingRule("a signal that it can send itself", "policy", ("signal",), "killed", limit=False, began=True),
+    EndingRule("it closed its pipe", "policy", ("pipe",), "killed", limit=False, began=True),
+    EndingRule("it broke the pipes' rules", "policy", ("frame",), "killed", limit=False, began=True),
+    EndingRule(_OPEN, "policy", _KILLED, "killed", limit=False, began=True, held=False),
+    EndingRule(_SEALED, "policy", _KILLED, "outside", limit=False, began=True, held=True),
+    EndingRule("bubblewrap or the zygote", "sandbox", None, "outside"),
+    EndingRule("the environment crashed on its actions", "environment", _CRASH, "killed", began=True),
+    EndingRule("the environment crashed before any", "environment", _CRASH, "outside", began=False),
+    EndingRule(_OVERRAN_AGAIN, "environment", ("overrun",), "killed", again=True),
+    EndingRule("the environment overran", "environment", ("overrun",), "outside", again=False),
+    EndingRule("the environment was killed or stopped", "environment", _FROM_OUTSIDE, "outside"),
+    EndingRule("the worker", "supervisor", None, "outside"),
 )
 """Every ending fits exactly one row."""
 

@@ -12,18 +12,18 @@ from evopolicy_common.catalogue import Entry
 from evopolicy_common.messages.environment import EnvironmentDescription
 from evopolicy_common.messages.episode import BlobRef, EpisodeOutcome, Job, PolicyFailure, Tier
 from evopolicy_common.processes.parent_death import end_with_parent
-from evopolicy_worker.environments.interface.calls import Limits
+from evopolicy_worker.environments.interface.calls import EnvironmentLimits
 from evopolicy_worker.slot_protocol.begun import PackedBegun
 
 LENGTH = struct.Struct("<I")
 
 
-class Message(msgspec.Struct, frozen=True, kw_only=True, tag_field="op", tag=str.lower):
+class SlotMessage(msgspec.Struct, frozen=True, kw_only=True, tag_field="op", tag=str.lower):
     """A message; `op` names its type."""
 
 
-class Start(Message, frozen=True, kw_only=True):
-    """The first message: how to set up the slot. Answered by Ready or Fault."""
+class SlotStart(SlotMessage, frozen=True, kw_only=True):
+    """The first message: how to set up the slot. Answered by SlotReady or Fault."""
 
     tier: Tier
     core: int | None
@@ -36,11 +36,11 @@ class Start(Message, frozen=True, kw_only=True):
     sealed: bool = True
     definitions: tuple[Entry, ...] = ()
     """Environments that do not ship."""
-    limits: Limits = Limits()
+    limits: EnvironmentLimits = EnvironmentLimits()
     """Of the environments."""
 
 
-class Files(msgspec.Struct, frozen=True):
+class BundleFiles(msgspec.Struct, frozen=True):
     """A bundle's files, which the process cannot read from disk."""
 
     names: list[tuple[str, bool, int]]
@@ -49,12 +49,12 @@ class Files(msgspec.Struct, frozen=True):
     """The files' contents, concatenated."""
 
 
-class Play(Message, frozen=True, kw_only=True):
-    """Play this job. The replies are any number of Progress; for each episode Acting, when its policy's first action
+class Play(SlotMessage, frozen=True, kw_only=True):
+    """Play this job. The replies are any number of JobProgress; for each episode Acting, when its policy's first action
     is due, and Finished; Begun when an episode is stopped; Filmed for each video; and last Played or Fault."""
 
     job: Job
-    bundle: Files | None
+    bundle: BundleFiles | None
     """None: the job has none, or the one that was sent last."""
     first: int = 0
     """Index in the job of the first episode to play."""
@@ -62,30 +62,30 @@ class Play(Message, frozen=True, kw_only=True):
     """The policy's failure in that episode: it crashed the process that played it before."""
 
 
-class Describe(Message, frozen=True, kw_only=True):
+class Describe(SlotMessage, frozen=True, kw_only=True):
     """Describe these environments. Answered by Described or Fault."""
 
     environments: tuple[str, ...]
 
 
-class Cancel(Message, frozen=True, kw_only=True):
+class Cancel(SlotMessage, frozen=True, kw_only=True):
     """Stop the running job, which then ends with Played."""
 
 
-class Ready(Message, frozen=True, kw_only=True):
+class SlotReady(SlotMessage, frozen=True, kw_only=True):
     """The process and its sandbox have started."""
 
 
-class Progress(Message, frozen=True, kw_only=True):
+class JobProgress(SlotMessage, frozen=True, kw_only=True):
     episodes_done: int
     steps: int
 
 
-class Acting(Message, frozen=True, kw_only=True):
+class Acting(SlotMessage, frozen=True, kw_only=True):
     """In the job's next episode, the first action of the policy is about to reach the environment."""
 
 
-class Finished(Message, frozen=True, kw_only=True):
+class Finished(SlotMessage, frozen=True, kw_only=True):
     """The outcome of the job's next episode."""
 
     outcome: EpisodeOutcome
@@ -96,7 +96,7 @@ class Finished(Message, frozen=True, kw_only=True):
     episode is, since the policy can measure the time."""
 
 
-class Filmed(Message, frozen=True, kw_only=True):
+class Filmed(SlotMessage, frozen=True, kw_only=True):
     """The video of one of the job's finished episodes."""
 
     place: int
@@ -104,7 +104,7 @@ class Filmed(Message, frozen=True, kw_only=True):
     video: BlobRef
 
 
-class Begun(Message, frozen=True, kw_only=True):
+class Begun(SlotMessage, frozen=True, kw_only=True):
     """The policy's actions so far in a stopped episode. Sent on Cancel, and before a Fault."""
 
     place: int
@@ -112,19 +112,19 @@ class Begun(Message, frozen=True, kw_only=True):
     begun: PackedBegun
 
 
-class Played(Message, frozen=True, kw_only=True):
+class Played(SlotMessage, frozen=True, kw_only=True):
     """The job is over: every episode has been reported by Finished, or it was cancelled."""
 
     cancelled: bool = False
 
 
-class Described(Message, frozen=True, kw_only=True):
+class Described(SlotMessage, frozen=True, kw_only=True):
     """The requested environments, in the order of the request."""
 
     environments: tuple[EnvironmentDescription, ...]
 
 
-class Fault(Message, frozen=True, kw_only=True):
+class Fault(SlotMessage, frozen=True, kw_only=True):
     """An infrastructure failure, never the policy's."""
 
     kind: str
@@ -132,8 +132,8 @@ class Fault(Message, frozen=True, kw_only=True):
     message: str
 
 
-Command = Start | Play | Describe | Cancel
-Reply = Ready | Progress | Acting | Finished | Filmed | Begun | Played | Described | Fault
+Command = SlotStart | Play | Describe | Cancel
+Reply = SlotReady | JobProgress | Acting | Finished | Filmed | Begun | Played | Described | Fault
 
 commands: msgspec.msgpack.Decoder[Command] = msgspec.msgpack.Decoder(Command)
 replies: msgspec.msgpack.Decoder[Reply] = msgspec.msgpack.Decoder(Reply)

@@ -11,7 +11,7 @@ Rules:
 | closed | `start` | ready; closed, with SandboxError or WorkerError |
 | ready | `play_job` | playing; in a new process if this one may remember a hidden episode, or cannot draw |
 | | `describe` | ready; its process has ended or is killed, with BrokenEnvironmentError or SlotDiedError |
-| playing | `Progress`, `Acting`, `Finished`, `Begun`, `Filmed` | playing |
+| playing | `JobProgress`, `Acting`, `Finished`, `Begun`, `Filmed` | playing |
 | | `Played` | ready, with the outcomes; without any after `cancel` |
 | | `Fault` | ready, with its error |
 | | the environment ends, breaks down or hangs on a policy's actions | playing, in a new process |
@@ -50,7 +50,7 @@ from evopolicy_common.messages.episode import EpisodeOutcome, Job, PolicyFailure
 from evopolicy_common.processes import proc
 from evopolicy_common.processes.child_process import ignore_broken_stdin
 from evopolicy_common.processes.scratch import remove_tree, scratch_folder
-from evopolicy_worker.environments.interface.calls import NOTE, USUAL, Limits, hung, last_words
+from evopolicy_worker.environments.interface.calls import NOTE, USUAL, EnvironmentLimits, hung, last_words
 from evopolicy_worker.environments.registry import remembers
 from evopolicy_worker.episodes.monitor import is_stopped
 from evopolicy_worker.sandbox import env_jail, jail
@@ -91,14 +91,14 @@ class Slot:
         *,
         sealed: bool = True,
         definitions: tuple[Entry, ...] = (),
-        limits: Limits = USUAL,
+        limits: EnvironmentLimits = USUAL,
     ) -> None:
         """`core`: the CPU that all processes are pinned to; None for no pinning. `scratch`: a folder for this slot
         alone. `definitions`: environments that do not ship. `limits`: those of an environment.
 
         `sealed=False` (tests only) leaves the policy's process unsealed.
         """
-        self._start = messages.Start(
+        self._start = messages.SlotStart(
             tier=tier,
             core=core,
             scratch=str(scratch),
@@ -163,7 +163,7 @@ class Slot:
             async with asyncio.timeout(START_TIMEOUT_S):
                 await self._send(start)
                 reply = await self._reply()
-            failed = None if isinstance(reply, messages.Ready) else _error(reply)
+            failed = None if isinstance(reply, messages.SlotReady) else _error(reply)
         except TimeoutError:
             failed = WorkerError(f"a slot did not start within {START_TIMEOUT_S:g} s")
         except SlotDiedError as error:
@@ -238,7 +238,7 @@ class Slot:
         await self._send(play)
         while True:
             match await self._reply():
-                case messages.Progress() as reply:
+                case messages.JobProgress() as reply:
                     on_progress(reply.episodes_done, reply.steps)
                 case messages.Acting():
                     self._acting = True
@@ -340,7 +340,7 @@ class Slot:
             self._listener = None
         await asyncio.to_thread(remove_tree, self._scratch)
 
-    async def _send(self, message: messages.Message) -> None:
+    async def _send(self, message: messages.SlotMessage) -> None:
         process = self._process
         assert process is not None
         assert process.stdin is not None
@@ -449,7 +449,7 @@ def _memory(pid: int) -> int:
     return sum(size if isinstance(size, int) else (size or (0, 0))[1] for size in sizes)
 
 
-def bundle_files(folder: Path) -> messages.Files:
+def bundle_files(folder: Path) -> messages.BundleFiles:
     """The unpacked bundle in `folder`. Raises WorkerError when it cannot be read."""
     names: list[tuple[str, bool, int]] = []
     data: list[bytes] = []
@@ -466,7 +466,7 @@ def bundle_files(folder: Path) -> messages.Files:
                 raise WorkerError(f"the unpacked bundle cannot be read: {error}") from error
             names.append((os.path.relpath(path, folder), executable, len(content)))
             data.append(content)
-    return messages.Files(names, b"".join(data))
+    return messages.BundleFiles(names, b"".join(data))
 
 
 _FAULTS = {"sandbox": SandboxError, "environment": BrokenEnvironmentError}

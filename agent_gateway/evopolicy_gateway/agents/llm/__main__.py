@@ -30,11 +30,11 @@ def main() -> int:
     # The model's commands have this process's user: without this they could read its key, and use it uncounted.
     ctypes.CDLL(None).prctl(_PR_SET_DUMPABLE, 0, 0, 0, 0)
     # The import takes seconds, which the version does not need.
-    from evopolicy_gateway.agents.llm.agent import Events, Session, play_turn
+    from evopolicy_gateway.agents.llm.agent import EventWriter, Session, play_turn
     from evopolicy_gateway.agents.llm.conversation import ApiError, Conversation, UserError
 
     session = Session(Path.home() / ".evopolicy-llm" / f"{given.session}.json")
-    events = Events(sys.stdout, given.session)
+    events = EventWriter(sys.stdout, given.session)
     order = json.load(sys.stdin)
     kept = session.load() if given.resume else b""
     try:

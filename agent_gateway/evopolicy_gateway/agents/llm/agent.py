@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, TextIO
 
 from evopolicy_gateway.agents.llm import shell
-from evopolicy_gateway.agents.llm.conversation import ApiError, Call, Conversation, Reply
+from evopolicy_gateway.agents.llm.conversation import ApiError, Conversation, ModelReply, ToolCall
 
 
 class Session:
@@ -29,7 +29,7 @@ class Session:
         os.replace(part, self._path)
 
 
-class Events:
+class EventWriter:
     """The turn's events, one JSON line each."""
 
     def __init__(self, out: TextIO, session: str) -> None:
@@ -43,7 +43,7 @@ class Events:
             self._emit({"type": "system", "subtype": "init", "session_id": self._session})
             self._session = None
 
-    def reply(self, reply: Reply) -> None:
+    def reply(self, reply: ModelReply) -> None:
         """The model's text and tool calls, and the tokens that they took."""
         blocks: list[dict[str, Any]] = [{"type": "text", "text": reply.text}] if reply.text else []
         blocks += [
@@ -53,7 +53,7 @@ class Events:
         message = {"id": f"m{self._n}", "role": "assistant", "content": blocks, "usage": reply.usage}
         self._emit({"type": "assistant", "message": message})
 
-    def output(self, call: Call, text: str, *, succeeded: bool) -> None:
+    def output(self, call: ToolCall, text: str, *, succeeded: bool) -> None:
         block = {"type": "tool_result", "tool_use_id": call.id, "content": text, "is_error": not succeeded}
         self._emit({"type": "user", "message": {"role": "user", "content": [block]}})
 
@@ -77,7 +77,7 @@ _TOLD, _MAX_SAME = 5, 10
 """How often the same command with the same output comes in a row until the model is told, and until the turn ends."""
 
 
-async def play_turn(api: Conversation, prompt: str, session: Session, events: Events) -> int:
+async def play_turn(api: Conversation, prompt: str, session: Session, events: EventWriter) -> int:
     """Plays one turn and returns the program's exit status."""
     api.say(prompt)
     n_faulty = n_same = 0

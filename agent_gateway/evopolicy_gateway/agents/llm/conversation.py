@@ -68,7 +68,7 @@ _LEAST_QUOTA_WAIT_S = 60.0
 
 
 @dataclass(frozen=True, kw_only=True)
-class Call:
+class ToolCall:
     id: str
     name: str = shell.NAME
     given: dict[str, Any] = field(default_factory=dict)
@@ -80,9 +80,9 @@ class Call:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Reply:
+class ModelReply:
     text: str
-    calls: tuple[Call, ...]
+    calls: tuple[ToolCall, ...]
     fault: str = ""
     """Why it is neither an end of the turn nor calls of the tool."""
     usage: dict[str, int]
@@ -147,7 +147,7 @@ class Conversation:
         system: list[ModelRequestPart] = [] if self.messages else [SystemPromptPart(self._system)]
         self.messages.append(ModelRequest([*system, UserPromptPart(text)]))
 
-    async def ask_model(self) -> Reply:
+    async def ask_model(self) -> ModelReply:
         """The model's answer, which is added to the messages. Raises ApiError."""
         try:
             with warnings.catch_warnings(action="ignore"):
@@ -175,7 +175,7 @@ class Conversation:
         text = "\n".join(part.content for part in _parts([response], TextPart))
         cut = _CUT if response.finish_reason == "length" else ""
         as_text = _CALL_IN_TEXT if not made and _AS_TEXT.search(text) else ""
-        return Reply(text=text, calls=tuple(made), usage=_usage(response), fault=cut or as_text)
+        return ModelReply(text=text, calls=tuple(made), usage=_usage(response), fault=cut or as_text)
 
     async def _told(self, error: errors.ModelHTTPError) -> ApiError:
         """The error in words that say what to do."""
@@ -219,7 +219,7 @@ class Conversation:
         self._streams = not _is_usable(response)
         return response
 
-    def answer(self, calls: Sequence[Call], outputs: Sequence[str]) -> None:
+    def answer(self, calls: Sequence[ToolCall], outputs: Sequence[str]) -> None:
         pairs = zip(calls, outputs, strict=True)
         parts = [ToolReturnPart(call.name, output, tool_call_id=call.id) for call, output in pairs]
         self.messages.append(ModelRequest(parts))
@@ -269,11 +269,11 @@ def _words(body: object) -> str:
     return body if isinstance(body, str) else ""
 
 
-def _call(identity: str, name: str, arguments: object) -> Call:
+def _call(identity: str, name: str, arguments: object) -> ToolCall:
     """A call as the model wrote it, which may be anything."""
     said = _decoded(arguments)
     given = said if isinstance(said, dict) else {"text": str(said)}
-    call = Call(id=identity, name=name, given=given)
+    call = ToolCall(id=identity, name=name, given=given)
     if name != shell.NAME:
         return replace(call, fault=f"there is no tool {name!r}; the only one is {shell.NAME}")
     if said is not given:

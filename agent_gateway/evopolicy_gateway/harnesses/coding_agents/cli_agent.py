@@ -31,7 +31,7 @@ from evopolicy_gateway.harnesses.coding_agents.turn_failure import TurnFailure, 
 from evopolicy_gateway.harnesses.interface.agent_config import relay_variables
 from evopolicy_gateway.harnesses.interface.base import AgentError, Harness, Stage
 from evopolicy_gateway.inputs import own_config
-from evopolicy_gateway.inputs.kept import Kept
+from evopolicy_gateway.inputs.kept import KeptInputs
 from evopolicy_gateway.processes.child_messages import AgentDoing, AgentEnded, RelayAddress
 from evopolicy_gateway.relay.limits import ModelTerms
 from evopolicy_gateway.relay.usage import Usage
@@ -75,7 +75,7 @@ class CliAgent(Harness):
         """Turns in a row that ended by faulty answers."""
         self._pause_s = self._config.pause_s
 
-    def take_inputs(self, kept: Kept) -> None:
+    def take_inputs(self, kept: KeptInputs) -> None:
         self._dialect.kept = kept
 
     def check(self, env: str) -> None:

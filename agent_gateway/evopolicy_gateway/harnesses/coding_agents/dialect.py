@@ -14,7 +14,7 @@ from typing import Any
 
 from evopolicy_gateway.harnesses.coding_agents.turn_failure import TurnFailure
 from evopolicy_gateway.harnesses.interface.agent_config import AgentConfig, TokenPaths
-from evopolicy_gateway.inputs.kept import Kept
+from evopolicy_gateway.inputs.kept import KeptInputs
 from evopolicy_gateway.processes.child_messages import RelayAddress
 from evopolicy_gateway.relay.answers import values
 from evopolicy_gateway.relay.usage import Usage, count
@@ -73,7 +73,7 @@ class Dialect(ABC):
 
     def __init__(self, config: AgentConfig) -> None:
         self.config = config
-        self.kept = Kept()
+        self.kept = KeptInputs()
         """The run's skills and MCP servers."""
         self.relay: RelayAddress | None = None
         """Where its program finds the model; None: at the provider."""

@@ -158,21 +158,21 @@ class ApiTable(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
         raise ConfigError(f"api.base_url = {self.base_url!r}: https://HOST… is needed, {way}")
 
 
-class Provider(NamedTuple):
+class ProviderDefaults(NamedTuple):
     base_url: str
     variable: str
     """Usual name of the variable with the key."""
     api: ApiName
 
 
-PROVIDERS: dict[ProviderName, Provider] = {
-    "openai": Provider("https://api.openai.com/v1", "OPENAI_API_KEY", "responses"),
-    "anthropic": Provider("https://api.anthropic.com", "ANTHROPIC_API_KEY", "messages"),
-    "google": Provider("https://generativelanguage.googleapis.com", "GEMINI_API_KEY", "gemini"),
-    "deepseek": Provider("https://api.deepseek.com", "DEEPSEEK_API_KEY", "chat"),
-    "moonshot": Provider("https://api.moonshot.ai/v1", "MOONSHOT_API_KEY", "chat"),
-    "mistral": Provider("https://api.mistral.ai/v1", "MISTRAL_API_KEY", "chat"),
-    "openrouter": Provider("https://openrouter.ai/api/v1", "OPENROUTER_API_KEY", "chat"),
+PROVIDERS: dict[ProviderName, ProviderDefaults] = {
+    "openai": ProviderDefaults("https://api.openai.com/v1", "OPENAI_API_KEY", "responses"),
+    "anthropic": ProviderDefaults("https://api.anthropic.com", "ANTHROPIC_API_KEY", "messages"),
+    "google": ProviderDefaults("https://generativelanguage.googleapis.com", "GEMINI_API_KEY", "gemini"),
+    "deepseek": ProviderDefaults("https://api.deepseek.com", "DEEPSEEK_API_KEY", "chat"),
+    "moonshot": ProviderDefaults("https://api.moonshot.ai/v1", "MOONSHOT_API_KEY", "chat"),
+    "mistral": ProviderDefaults("https://api.mistral.ai/v1", "MISTRAL_API_KEY", "chat"),
+    "openrouter": ProviderDefaults("https://openrouter.ai/api/v1", "OPENROUTER_API_KEY", "chat"),
 }
 _FAMILIES: dict[ApiName, Protocol] = {
     "responses": "openai",

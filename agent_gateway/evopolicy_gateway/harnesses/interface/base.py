@@ -20,7 +20,7 @@ from typing import Any
 import msgspec
 
 from evopolicy_common.errors import EvopolicyError
-from evopolicy_gateway.inputs.kept import Kept
+from evopolicy_gateway.inputs.kept import KeptInputs
 from evopolicy_gateway.jail.jail import Jail
 from evopolicy_gateway.processes.agent_process import AgentLog, AgentProcess
 from evopolicy_gateway.processes.child_messages import AgentDoing, AgentEnded, RelayAddress
@@ -118,7 +118,7 @@ class Harness(ABC):
     continues = False
     """Whether its program continues by itself from its workspace when it is started again, without a session."""
 
-    def take_inputs(self, kept: Kept) -> None:
+    def take_inputs(self, kept: KeptInputs) -> None:
         """Gives it the run's skills and MCP servers, before it plays."""
         assert not kept, "only agents with settings have inputs"
 

@@ -84,7 +84,7 @@ class Pictures:
         return ["pictures", self._n, self._dtype.str, list(self._shape), data]
 
 
-class Column:
+class StepColumn:
     """Rows of one leaf, or of a dict or tuple of columns."""
 
     def __init__(
@@ -114,7 +114,7 @@ class Column:
 
     def values(self) -> Any:
         """The column in the form described at `Trajectory.obs`."""
-        return self._each(Column.values) if self.kind in ("dict", "tuple") else self.data
+        return self._each(StepColumn.values) if self.kind in ("dict", "tuple") else self.data
 
     def form(self) -> object:
         """Equal for columns that can be joined as they are."""
@@ -122,13 +122,13 @@ class Column:
             return self.kind, self.data.dtype, self.data.shape[1:]
         return self.kind, tuple(self.data) if isinstance(self.data, dict) else ()
 
-    def _each(self, made_of: Callable[[Column], Any]) -> Any:
+    def _each(self, made_of: Callable[[StepColumn], Any]) -> Any:
         parts = {key: made_of(part) for key, part in self.data.items()}
         return parts if self.kind == "dict" else tuple(parts.values())
 
 
 def leaves(values: Any, path: str = "") -> Iterator[tuple[str, Any]]:
-    """The leaves of `Column.values()` by path: keys and positions joined by `/`; a single leaf has an empty path."""
+    """The leaves of `StepColumn.values()` by path: keys and positions joined by `/`; empty for a single leaf."""
     if isinstance(values, dict):
         for key, item in values.items():
             yield from leaves(item, f"{path}/{key}" if path else str(key))
@@ -139,7 +139,7 @@ def leaves(values: Any, path: str = "") -> Iterator[tuple[str, Any]]:
         yield path, values
 
 
-def unpack(packed: list[Any], *, pictures: bool = False) -> Column:
+def unpack(packed: list[Any], *, pictures: bool = False) -> StepColumn:
     """Unpacks the output of `pack` or, with `pictures`, of `Pictures.packed`. Raises ValueError for anything else."""
     kind = packed[0]
     if kind == "array" or (kind == "pictures" and pictures):
@@ -150,24 +150,24 @@ def unpack(packed: list[Any], *, pictures: bool = False) -> Column:
             if not 0 < size <= min(MAX_COLUMN_BYTES, most_of(data)):
                 raise ValueError(f"{len(data)} bytes that claim to be pictures of {size} bytes")
             data = zstandard.ZstdDecompressor().decompress(data, max_output_size=size)
-        return Column("array", _shaped(_array(dtype, data), shape, n), n)
+        return StepColumn("array", _shaped(_array(dtype, data), shape, n), n)
     if kind == "scalar":
         numbers = _array(packed[1], packed[2])
-        return Column("scalar", numbers, len(numbers))
+        return StepColumn("scalar", numbers, len(numbers))
     if kind == "text":
         texts = [packed[1][index] for index in _array("<u4", packed[2])]
-        return Column("values", texts, len(texts))
+        return StepColumn("values", texts, len(texts))
     if kind == "dict":
         _, n, keys, parts = packed
-        return Column("dict", dict(zip(keys, map(unpack, parts), strict=True)), n)
+        return StepColumn("dict", dict(zip(keys, map(unpack, parts), strict=True)), n)
     if kind == "tuple":
-        return Column("tuple", dict(enumerate(map(unpack, packed[2]))), packed[1])
+        return StepColumn("tuple", dict(enumerate(map(unpack, packed[2]))), packed[1])
     if kind == "values":
-        return Column("values", packed[1], len(packed[1]))
+        return StepColumn("values", packed[1], len(packed[1]))
     raise ValueError(f"unknown kind of column {kind!r}")
 
 
-def join(columns: list[Column]) -> Column:
+def join(columns: list[StepColumn]) -> StepColumn:
     """Joins the columns of successive blocks."""
     first, n = columns[0], sum(column.n for column in columns)
     if len(columns) == 1:
@@ -175,9 +175,9 @@ def join(columns: list[Column]) -> Column:
     if first.kind != "values" and len({column.form() for column in columns}) == 1:
         parts = [column.data for column in columns]
         if isinstance(first.data, dict):
-            return Column(first.kind, {key: join([part[key] for part in parts]) for key in first.data}, n)
-        return Column(first.kind, np.concatenate(parts), n)
-    return Column("values", [item for column in columns for item in column.rows()], n)
+            return StepColumn(first.kind, {key: join([part[key] for part in parts]) for key in first.data}, n)
+        return StepColumn(first.kind, np.concatenate(parts), n)
+    return StepColumn("values", [item for column in columns for item in column.rows()], n)
 
 
 # Values that msgpack cannot represent.

@@ -68,7 +68,7 @@ _ODD = (
 )
 
 
-class File(msgspec.Struct, frozen=True, kw_only=True):
+class FeedbackFile(msgspec.Struct, frozen=True, kw_only=True):
     """One feedback file in the container."""
 
     name: Literal["trajectory.jsonl", "observations.npz"]
@@ -81,7 +81,7 @@ class Header(msgspec.Struct, frozen=True, kw_only=True):
     observations: ObservationForm
     n: int
     """Number of steps."""
-    files: tuple[File, ...]
+    files: tuple[FeedbackFile, ...]
     left_out: str = ""
     """Why there are no files, or only the rows; empty when nothing is missing."""
 
@@ -125,10 +125,10 @@ class Renderer(Recorder):
             [MAGIC, *(piece for part in parts for piece in (_LENGTH.pack(sum(map(len, part))), *part))]
         )
 
-    def _files(self) -> Iterator[tuple[File, list[bytes]]]:
+    def _files(self) -> Iterator[tuple[FeedbackFile, list[bytes]]]:
         """The files in pieces: once joined, each takes its memory again."""
         yield (
-            File(name=ROWS, size=self._rows_size, packed="zstd"),
+            FeedbackFile(name=ROWS, size=self._rows_size, packed="zstd"),
             [*self._rows, self._compressor.flush()],
         )
         if self._npz is None or self._unstored or not self._n_packed:
@@ -138,7 +138,7 @@ class Renderer(Recorder):
         except ProtocolError as error:
             self._unstored = str(error)
         else:
-            yield File(name=OBSERVATIONS, size=sum(map(len, pieces)), packed="as it is"), pieces
+            yield FeedbackFile(name=OBSERVATIONS, size=sum(map(len, pieces)), packed="as it is"), pieces
 
     def _taker(self, obs: Any, is_picture: bool) -> Callable[[Any], bool | None]:
         # Arrays are held outside the block: a block of pictures would be large.
@@ -355,7 +355,7 @@ def _parts(data: bytes) -> list[memoryview]:
     return parts
 
 
-def _unpacked(file: File, data: memoryview) -> bytes:
+def _unpacked(file: FeedbackFile, data: memoryview) -> bytes:
     most = MAX_ROWS_BYTES if file.name == ROWS else MAX_OBSERVATIONS_BYTES
     if not 0 <= file.size <= most:
         raise ValueError(f"{file.name} of {file.size:,} bytes; {most:,} are the limit")

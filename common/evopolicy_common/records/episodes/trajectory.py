@@ -209,8 +209,8 @@ def _decode(data: bytes, max_bytes: int) -> Trajectory:
     header = columns.decoder.decode(next(frames, b"")[:_MAX_HEADER_BYTES])
     full, lists = header["record"] == "full", header["observations"] == "lists"
     decompressor = zstandard.ZstdDecompressor()
-    all_obs: list[columns.Column] = []
-    all_actions: list[columns.Column] = []
+    all_obs: list[columns.StepColumn] = []
+    all_actions: list[columns.StepColumn] = []
     all_rewards: list[bytes] = []
     all_flags: list[bytes] = []
     infos: list[dict[str, Any]] = []
@@ -248,7 +248,7 @@ def _decode(data: bytes, max_bytes: int) -> Trajectory:
         all_rewards.append(block["rewards"])
         all_flags.append(block["flags"])
     observed = columns.join(all_obs) if all_obs else None
-    actions = columns.join(all_actions) if all_actions else columns.Column("values", [], 0)
+    actions = columns.join(all_actions) if all_actions else columns.StepColumn("values", [], 0)
     flags = np.frombuffer(b"".join(all_flags), dtype=np.uint8)
 
     def obs_at(t: int) -> Any:

@@ -162,7 +162,7 @@ def copy_history(
     return omitted
 
 
-class Recorder:
+class TreeRecorder:
     """Records the workspace of one run. Contents of an earlier process count."""
 
     def __init__(self, workspace: Path, folder: Path, *, started: bool = False) -> None:

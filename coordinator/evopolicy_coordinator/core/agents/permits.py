@@ -23,7 +23,7 @@ from evopolicy_coordinator.core.isolation.conflicts import put
 from evopolicy_coordinator.core.structures import pop_entry
 from evopolicy_coordinator.core.tables.model import Ask, CaseSet, Kernel, Run
 from evopolicy_coordinator.core.tables.state import State
-from evopolicy_coordinator.core.tables.step import Step
+from evopolicy_coordinator.core.tables.step import CoreStep
 
 CANCELLED_S = 30.0
 """An agent has this long to end after its run was cancelled."""
@@ -49,7 +49,7 @@ def places(state: State, run: str) -> set[str]:
 # ---- requests ----
 
 
-def ask_permit(state: State, run: Run, row: PermitRow, step: Step) -> Reason | None:
+def ask_permit(state: State, run: Run, row: PermitRow, step: CoreStep) -> Reason | None:
     """Request a permit, again or for the first time. Returns the reason that it waits for; None when it is granted."""
     kernel, case_set = conflicts.kernel(state, row.boot_id), run.case_set
     if run.id in kernel.permits.get(case_set, ()):
@@ -61,7 +61,7 @@ def ask_permit(state: State, run: Run, row: PermitRow, step: Step) -> Reason | N
     return _grant(state, run.id, kernel, case_set, step)
 
 
-def _grant(state: State, run: str, kernel: Kernel, case_set: CaseSet, step: Step) -> Reason | None:
+def _grant(state: State, run: str, kernel: Kernel, case_set: CaseSet, step: CoreStep) -> Reason | None:
     waits_for = conflicts.permit_conflict(state, case_set, kernel)
     if waits_for is not None:
         return waits_for
@@ -92,7 +92,7 @@ def _withdraw(state: State, run: str, kernel: Kernel, case_set: CaseSet) -> Ask 
     return ask
 
 
-def forget_ask(state: State, run: str, boot_id: str, step: Step) -> None:
+def forget_ask(state: State, run: str, boot_id: str, step: CoreStep) -> None:
     """Remove a permit request that was not repeated, and free the jobs that it barred."""
     ask = state.asks.get((run, boot_id))
     if ask is not None:
@@ -101,19 +101,19 @@ def forget_ask(state: State, run: str, boot_id: str, step: Step) -> None:
         conflicts.tidy(state, ask.kernel)
 
 
-def ask_ended(state: State, key: tuple[str, str], step: Step) -> None:
+def ask_ended(state: State, key: tuple[str, str], step: CoreStep) -> None:
     """A permit request's deadline: it was not repeated in time."""
     forget_ask(state, *key, step)
 
 
-def settle(state: State, step: Step) -> None:
+def settle(state: State, step: CoreStep) -> None:
     """At the end of a step: grant requested permits that have become possible."""
     state.grantable = False
     for ask in list(state.asks.values()):
         _grant(state, ask.row.run, ask.kernel, ask.case_set, step)
 
 
-def drop_asks(state: State, run: str, reason: Reason, step: Step) -> None:
+def drop_asks(state: State, run: str, reason: Reason, step: CoreStep) -> None:
     """Remove a run's permit requests and refuse its waiting polls."""
     for name, boot_id in [key for key in state.asks if key[0] == run]:
         forget_ask(state, name, boot_id, step)
@@ -124,7 +124,7 @@ def drop_asks(state: State, run: str, reason: Reason, step: Step) -> None:
 # ---- the end ----
 
 
-def end(state: State, run: str, step: Step, why: str, *, boot_id: str = "") -> None:
+def end(state: State, run: str, step: CoreStep, why: str, *, boot_id: str = "") -> None:
     """End the permits of a run whose agent is gone, from one kernel or (`boot_id` empty) from all. Its permit for an
     unknown kernel ends in both cases."""
     for kernel, row in permits_of_run(state, run):
@@ -134,7 +134,7 @@ def end(state: State, run: str, step: Step, why: str, *, boot_id: str = "") -> N
         state.timers.disarm(("cancelled", run))
 
 
-def _end(state: State, kernel: Kernel, row: PermitRow, step: Step, why: str) -> None:
+def _end(state: State, kernel: Kernel, row: PermitRow, step: CoreStep, why: str) -> None:
     _, case_set = state.permits[row.run][kernel]
     pop_entry(state.permits, row.run, kernel)
     pop_entry(kernel.permits, case_set, row.run)
@@ -145,12 +145,12 @@ def _end(state: State, kernel: Kernel, row: PermitRow, step: Step, why: str) -> 
     state.case_sets.leave(case_set)
 
 
-def agent_ended(state: State, run: str, step: Step) -> None:
+def agent_ended(state: State, run: str, step: CoreStep) -> None:
     """A cancelled run's deadline: its agent has had its time to end."""
     end(state, run, step, "its run was cancelled")
 
 
-def cancelled(state: State, run: str, step: Step, at: float | None = None) -> None:
+def cancelled(state: State, run: str, step: CoreStep, at: float | None = None) -> None:
     """Set the deadline after which the permits of a cancelled run end; its agent is being ended."""
     if permits_of_run(state, run):
         state.timers.arm(("cancelled", run), (step.now if at is None else at) + CANCELLED_S)
@@ -161,7 +161,7 @@ def load(
     rows: Iterable[PermitRow],
     runs: dict[str, RunRow],
     states: dict[str, RunStateRow],
-    step: Step,
+    step: CoreStep,
 ) -> None:
     """Restore the stored permits, before any job is played."""
     for row in rows:

@@ -37,19 +37,19 @@ from evopolicy_coordinator.core.tables.model import (
     Reservation,
 )
 from evopolicy_coordinator.core.tables.state import State
-from evopolicy_coordinator.core.tables.step import AgentOverdue, Step
+from evopolicy_coordinator.core.tables.step import AgentOverdue, CoreStep
 
 CHECK_S = 1.0
 """Interval between checks of waiting hidden jobs, and of train jobs that hidden ones may keep waiting."""
 
 
-def watch(state: State, lane: Lane, step: Step) -> None:
+def watch(state: State, lane: Lane, step: CoreStep) -> None:
     """Schedule the lane's next check, if it has anything to check."""
     if state.isolates and (lane.waiting[HIDDEN] or lane.reservations or lane.waiting[TRAIN]):
         state.timers.arm_once(("hidden", lane.key), step.now + CHECK_S)
 
 
-def check_due(state: State, key: LaneKey, step: Step) -> None:
+def check_due(state: State, key: LaneKey, step: CoreStep) -> None:
     """A lane's deadline: reserve a kernel for hidden jobs that have waited for long, or release it; update the
     held submits."""
     lane = state.lanes.get(key)
@@ -79,7 +79,7 @@ def _at_work(state: State, lane: Lane, now: float) -> Iterator[Kernel]:
             yield worker.kernel
 
 
-def _kept(state: State, lane: Lane, case_set: CaseSet, passed_s: float, step: Step) -> None:
+def _kept(state: State, lane: Lane, case_set: CaseSet, passed_s: float, step: CoreStep) -> None:
     """Count the wait of a case set's hidden jobs, which are kept from all kernels; reserve one for those that have
     waited for long."""
     waiting: dict[Flow, None] = {flow: None for _, _, flow in lane.heaps[HIDDEN] if flow.n_ready[HIDDEN]}
@@ -98,7 +98,7 @@ def _kept(state: State, lane: Lane, case_set: CaseSet, passed_s: float, step: St
         _reserve(state, lane, case_set, long, step)
 
 
-def _end_overdue(state: State, reservation: Reservation, step: Step) -> None:
+def _end_overdue(state: State, reservation: Reservation, step: CoreStep) -> None:
     """Report the runs whose agents have kept hidden jobs from a reserved kernel for too long."""
     for kernel in (reservation.kernel, state.everywhere):
         for row in all_related(kernel.permits, reservation.case_set):
@@ -106,7 +106,7 @@ def _end_overdue(state: State, reservation: Reservation, step: Step) -> None:
                 step.tell(AgentOverdue(state.runs[row.run]))
 
 
-def _reserve(state: State, lane: Lane, case_set: CaseSet, flows: dict[Flow, None], step: Step) -> None:
+def _reserve(state: State, lane: Lane, case_set: CaseSet, flows: dict[Flow, None], step: CoreStep) -> None:
     def in_the_way(kernel: Kernel) -> tuple[int, int]:
         return len(all_related(kernel.permits, case_set)), len(all_related(kernel.train, case_set))
 
@@ -118,7 +118,7 @@ def _reserve(state: State, lane: Lane, case_set: CaseSet, flows: dict[Flow, None
     step.log("info", "hidden_first", env=lane.key[0], boot_id=kernel.boot_id, agents=in_the_way(kernel)[0])
 
 
-def _release(state: State, reservation: Reservation, step: Step, why: str) -> None:
+def _release(state: State, reservation: Reservation, step: CoreStep, why: str) -> None:
     """Release a reserved kernel: agents have precedence again."""
     kernel, case_set, lane = reservation.kernel, reservation.case_set, reservation.lane
     del lane.reservations[case_set]
@@ -129,7 +129,7 @@ def _release(state: State, reservation: Reservation, step: Step, why: str) -> No
     state.case_sets.leave(case_set)
 
 
-def _train(state: State, lane: Lane, step: Step) -> None:
+def _train(state: State, lane: Lane, step: CoreStep) -> None:
     """Start or stop counting the time for which submits are held."""
     barred = {
         case_set

@@ -12,7 +12,7 @@ from evopolicy_coordinator.core.isolation import conflicts
 from evopolicy_coordinator.core.structures.timers import Poll
 from evopolicy_coordinator.core.tables.model import EVERYWHERE, Run
 from evopolicy_coordinator.core.tables.state import State
-from evopolicy_coordinator.core.tables.step import Step
+from evopolicy_coordinator.core.tables.step import CoreStep
 
 ASK_AGAIN_S = 10.0
 """A declined permit request is kept for this long, until the gateway repeats it."""
@@ -57,7 +57,7 @@ def over(state: State, name: str) -> Reason:
 # ---- permits ----
 
 
-def requested(state: State, event: events.Requested[gateway.RequestPermit], step: Step) -> None:
+def requested(state: State, event: events.Requested[gateway.RequestPermit], step: CoreStep) -> None:
     """A gateway requests that its agent may be alive on a kernel."""
     message = event.message
     run = state.runs.get(message.run)
@@ -81,21 +81,21 @@ def requested(state: State, event: events.Requested[gateway.RequestPermit], step
         step.reply(event.request, gateway.Permit(granted=False), waits_for)
 
 
-def answer(state: State, poll: Poll, step: Step) -> None:
+def answer(state: State, poll: Poll, step: CoreStep) -> None:
     """A gateway's wait for a permit has timed out."""
     _, run, boot_id = poll.target.split(" ", 2)
     waits_for = conflicts.permit_conflict(state, state.runs[run].case_set, conflicts.kernel(state, boot_id))
     step.reply(poll.request, gateway.Permit(granted=False), waits_for)
 
 
-def demand_permit(state: State, run: Run, step: Step) -> None:
+def demand_permit(state: State, run: Run, step: CoreStep) -> None:
     """Raises NotDoneError (UNAVAILABLE) while a run's agent, which may be on any machine, lacks a permit."""
     waits_for = _implied(state, run, step) if run.state.phase == "open" else None
     if waits_for is not None:
         raise NotDoneError("may_not_start", waits_for=waits_for)
 
 
-def _implied(state: State, run: Run, step: Step) -> Reason | None:
+def _implied(state: State, run: Run, step: CoreStep) -> Reason | None:
     """Request the permit for any kernel for a run whose gateway requests none. Returns the reason that it waits for;
     None when the run has a permit or needs none."""
     kernel = permits.place(run, EVERYWHERE)
@@ -107,7 +107,7 @@ def _implied(state: State, run: Run, step: Step) -> Reason | None:
     return waits_for
 
 
-def agent_gone(state: State, event: events.Requested[operator.AgentGone], step: Step) -> None:
+def agent_gone(state: State, event: events.Requested[operator.AgentGone], step: CoreStep) -> None:
     """An operator confirms that a run's agent is no longer alive."""
     message = event.message
     known_run(state, message.run)
@@ -122,7 +122,7 @@ def stamp(state: State, row: RunRow) -> HiddenIsolation:
     return "waived" if row.settings.agent_host == ELSEWHERE else "exclusive"
 
 
-def resume(state: State, run: Run, step: Step) -> None:
+def resume(state: State, run: Run, step: CoreStep) -> None:
     """Restore the isolation and permits of an unfinished run in a core that was just loaded."""
     before = run.state.isolation
     if before == "unknown":

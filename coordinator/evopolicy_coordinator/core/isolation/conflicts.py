@@ -28,7 +28,7 @@ from evopolicy_coordinator.core.tables.model import (
     Worker,
 )
 from evopolicy_coordinator.core.tables.state import State
-from evopolicy_coordinator.core.tables.step import Step
+from evopolicy_coordinator.core.tables.step import CoreStep
 
 T = TypeVar("T")
 
@@ -53,7 +53,7 @@ def serving(state: State, lane: Lane) -> Iterator[Kernel]:
     return (workers[name].kernel for profile in lane.profiles for name in profile.workers)
 
 
-def freed(state: State, case_set: CaseSet | None, step: Step, *, train_too: bool = True) -> None:
+def freed(state: State, case_set: CaseSet | None, step: CoreStep, *, train_too: bool = True) -> None:
     """Mark the lanes of a case set's waiting jobs after a bar was lifted on some kernel: for hidden jobs, and with
     `train_too` also for train jobs and permits."""
     state.grantable = state.grantable or train_too

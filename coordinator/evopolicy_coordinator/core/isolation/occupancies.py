@@ -18,12 +18,12 @@ from evopolicy_coordinator.core.contract.records import KernelRow
 from evopolicy_coordinator.core.isolation import conflicts
 from evopolicy_coordinator.core.isolation.conflicts import put, related
 from evopolicy_coordinator.core.structures import pop_entry
-from evopolicy_coordinator.core.tables.model import Lease, Occupancies, Occupancy, Worker
+from evopolicy_coordinator.core.tables.model import Occupancies, Occupancy, OpenLease, Worker
 from evopolicy_coordinator.core.tables.state import State
-from evopolicy_coordinator.core.tables.step import Step
+from evopolicy_coordinator.core.tables.step import CoreStep
 
 
-def leased(state: State, lease: Lease, worker: Worker, serial: int, step: Step) -> None:
+def leased(state: State, lease: OpenLease, worker: Worker, serial: int, step: CoreStep) -> None:
     """Enter the occupancy of a lease that a worker was granted or continues."""
     before = state.lingering.get(worker.name, {}).get(lease.id)
     if before is not None:
@@ -47,7 +47,7 @@ def _index(occupancy: Occupancy) -> Occupancies:
     return occupancy.kernel.hidden if occupancy.hidden else occupancy.kernel.train
 
 
-def vacate(state: State, lease: Lease, worker: Worker, step: Step, *, sure: bool) -> None:
+def vacate(state: State, lease: OpenLease, worker: Worker, step: CoreStep, *, sure: bool) -> None:
     """A worker no longer holds a lease: surely, or only by the coordinator's decision."""
     occupancy, lease.occupancy = lease.occupancy, None
     if occupancy is None:
@@ -59,7 +59,7 @@ def vacate(state: State, lease: Lease, worker: Worker, step: Step, *, sure: bool
         _linger(state, occupancy, max(worker.last_seen, lease.granted_at))
 
 
-def _gone(state: State, occupancy: Occupancy, step: Step) -> None:
+def _gone(state: State, occupancy: Occupancy, step: CoreStep) -> None:
     """Remove an ended occupancy, and mark the work that it barred."""
     index, case_set = _index(occupancy), occupancy.case_set
     pop_entry(index, case_set, occupancy.key)
@@ -69,13 +69,13 @@ def _gone(state: State, occupancy: Occupancy, step: Step) -> None:
     state.case_sets.leave(case_set)
 
 
-def forget(state: State, occupancy: Occupancy, step: Step) -> None:
+def forget(state: State, occupancy: Occupancy, step: CoreStep) -> None:
     """Remove a lingering occupancy that has surely ended."""
     pop_entry(state.lingering, occupancy.worker, occupancy.id)
     _gone(state, occupancy, step)
 
 
-def heard(state: State, worker: Worker, named: set[str], settled: int, step: Step) -> None:
+def heard(state: State, worker: Worker, named: set[str], settled: int, step: CoreStep) -> None:
     """Process a heartbeat: the worker has released those given-up leases that it does not name."""
     for occupancy in list(state.lingering.get(worker.name, {}).values()):
         if occupancy.id in named:
@@ -100,7 +100,7 @@ def surely(worker: Worker, occupancy: Occupancy | None, settled: int) -> bool:
     return settled >= serial
 
 
-def unknown(state: State, worker: Worker, item: HeldLease, step: Step) -> None:
+def unknown(state: State, worker: Worker, item: HeldLease, step: CoreStep) -> None:
     """Enter an occupancy for a lease of an earlier incarnation that a worker names but that does not count: the worker
     may play it until it has stopped."""
     known = item.attempt > state.first_attempt or item.lease_id in state.lingering.get(worker.name, {})
@@ -129,7 +129,7 @@ def _linger(state: State, occupancy: Occupancy, since: float) -> None:
     state.timers.arm_once(("linger", occupancy.worker), occupancy.until)
 
 
-def expire(state: State, name: str, step: Step) -> None:
+def expire(state: State, name: str, step: CoreStep) -> None:
     """A worker's deadline: remove the given-up occupancies whose time is up."""
     for occupancy in list(state.lingering.get(name, {}).values()):
         assert occupancy.until is not None
@@ -143,7 +143,7 @@ def expire(state: State, name: str, step: Step) -> None:
 # ---- workers ----
 
 
-def joined(state: State, worker: Worker, step: Step) -> None:
+def joined(state: State, worker: Worker, step: CoreStep) -> None:
     """Enter a newly registered worker on its kernel."""
     worker.kernel.workers[worker.name] = None
     row = KernelRow(worker=worker.name, boot_id=worker.kernel.boot_id, machine=worker.machine)
@@ -158,7 +158,7 @@ def forgotten(state: State, worker: Worker) -> None:
         conflicts.tidy(state, worker.kernel)
 
 
-def load(state: State, known_kernels: Iterable[KernelRow], step: Step) -> None:
+def load(state: State, known_kernels: Iterable[KernelRow], step: CoreStep) -> None:
     """Restore the kernels of workers at their last registration, before any job is played: they
     may still play there."""
     for known in known_kernels:

@@ -21,7 +21,7 @@ from evopolicy_coordinator.core.leasing import queue
 from evopolicy_coordinator.core.structures import pop_entry
 from evopolicy_coordinator.core.tables.model import Flow, JobState, Kernel, OutOfService, Profile, Worker
 from evopolicy_coordinator.core.tables.state import State
-from evopolicy_coordinator.core.tables.step import Step
+from evopolicy_coordinator.core.tables.step import CoreStep
 
 BENCH_AFTER = 3
 """Consecutive failures after which a worker is benched."""
@@ -58,7 +58,7 @@ def _told_size(message: wire.Register) -> int:
     return sum(map(len, (*message.undescribed, *failed, *failed.values())))
 
 
-def register(state: State, event: WorkerRegistered, kernel: Kernel, step: Step) -> Worker:
+def register(state: State, event: WorkerRegistered, kernel: Kernel, step: CoreStep) -> Worker:
     """Add a worker, or replace it under a new session."""
     message = event.message
     profile = _profile(state, event)
@@ -165,7 +165,7 @@ def forget(state: State, worker: Worker) -> None:
     _drop_unused(state, worker.profile)
 
 
-def answer_beat(state: State, worker: Worker, stop: tuple[str, ...], step: Step) -> None:
+def answer_beat(state: State, worker: Worker, stop: tuple[str, ...], step: CoreStep) -> None:
     """Answer a worker's delayed heartbeat, if there is one."""
     request, worker.beat = worker.beat, None
     if request is None:
@@ -185,20 +185,24 @@ def _wanted(state: State, worker: Worker) -> tuple[str, ...]:
     return tuple(sorted(worker.undescribed.intersection(waiting)))
 
 
-def await_description(state: State, event: DescriptionAwaited, step: Step) -> None:
+def await_description(state: State, event: DescriptionAwaited, step: CoreStep) -> None:
     """Have the environment described by the workers that offer it, with their next heartbeats."""
     if any(event.env in worker.undescribed for worker in state.workers.values()):
         state.awaited[event.env] = None
 
 
-def drop_poll(state: State, worker: Worker, step: Step) -> None:
+def drop_poll(state: State, worker: Worker, step: CoreStep) -> None:
     """Answer a worker's waiting poll with no leases."""
     if worker.poll is not None:
         answer_poll(state, worker, (), step)
 
 
 def answer_poll(
-    state: State, worker: Worker, leases: tuple[wire.Lease, ...], step: Step, cancelled: tuple[str, ...] = ()
+    state: State,
+    worker: Worker,
+    leases: tuple[wire.Lease, ...],
+    step: CoreStep,
+    cancelled: tuple[str, ...] = (),
 ) -> None:
     poll = worker.poll
     assert poll is not None
@@ -208,14 +212,14 @@ def answer_poll(
     step.reply(poll.request, wire.Leases(leases=leases, cancelled=cancelled))
 
 
-def poll_ended(state: State, name: str, step: Step) -> None:
+def poll_ended(state: State, name: str, step: CoreStep) -> None:
     """A lease poll has timed out."""
     worker = state.workers.get(name)
     if worker is not None:
         drop_poll(state, worker, step)
 
 
-def beat_ended(state: State, name: str, step: Step) -> None:
+def beat_ended(state: State, name: str, step: CoreStep) -> None:
     """A heartbeat's delay is over."""
     worker = state.workers.get(name)
     if worker is not None:
@@ -251,7 +255,7 @@ def unpark(worker: Worker) -> None:
         pop_entry(profile.warm, item, worker.name)
 
 
-def failed(state: State, worker: Worker, step: Step) -> None:
+def failed(state: State, worker: Worker, step: CoreStep) -> None:
     """Count one more failure through the worker's own fault; bench it after `BENCH_AFTER` in a row."""
     worker.failures += 1
     if worker.failures >= BENCH_AFTER:

@@ -12,10 +12,10 @@ from evopolicy_coordinator.core.contract.records import OutcomeHead
 from evopolicy_coordinator.core.leasing import fleet, leases, queue
 from evopolicy_coordinator.core.tables.model import JobGroup, JobState, OutcomeDigest
 from evopolicy_coordinator.core.tables.state import State
-from evopolicy_coordinator.core.tables.step import Step
+from evopolicy_coordinator.core.tables.step import CoreStep
 
 
-def open_group(state: State, group: JobGroup, step: Step) -> None:
+def open_group(state: State, group: JobGroup, step: CoreStep) -> None:
     """Queue the unfinished jobs of a group. While the core is loaded, jobs first wait to be adopted."""
     state.groups[group.id] = group
     group.flow.n_hidden += group.hidden
@@ -63,7 +63,7 @@ def _cut(group: JobGroup, heads: list[OutcomeHead], attempts: int, now: float) -
     return list(group.jobs.values())
 
 
-def close_group(state: State, group: JobGroup, step: Step) -> None:
+def close_group(state: State, group: JobGroup, step: CoreStep) -> None:
     """Close a group: its leased jobs are stopped, and no more of its jobs are played."""
     for job in list(group.jobs.values()):
         close_job(state, job, step)
@@ -74,7 +74,7 @@ def close_group(state: State, group: JobGroup, step: Step) -> None:
     state.timers.disarm(("submit", group.id))
 
 
-def close_job(state: State, job: JobState, step: Step) -> None:
+def close_job(state: State, job: JobState, step: CoreStep) -> None:
     """Stop and remove an open job."""
     if job.lease is not None:
         leases.stop(state, job.lease, step)

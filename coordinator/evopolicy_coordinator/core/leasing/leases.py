@@ -21,9 +21,9 @@ from evopolicy_common.messages import worker as wire
 from evopolicy_coordinator.core.isolation import conflicts, occupancies
 from evopolicy_coordinator.core.leasing import fleet, queue
 from evopolicy_coordinator.core.leasing.jobs import JobFailure, build, decide
-from evopolicy_coordinator.core.tables.model import JobGroup, JobState, Lease, Worker
+from evopolicy_coordinator.core.tables.model import JobGroup, JobState, OpenLease, Worker
 from evopolicy_coordinator.core.tables.state import State
-from evopolicy_coordinator.core.tables.step import JobRetried, Step
+from evopolicy_coordinator.core.tables.step import CoreStep, JobRetried
 
 MISSING_BEATS = 3
 """A lease that its worker has not named for this many heartbeat intervals since the grant has never arrived."""
@@ -52,7 +52,7 @@ def granted(state: State, name: str, job_id: str, attempt: int, worker: Worker) 
 # ---- granting ----
 
 
-def grant(state: State, job: JobState, worker: Worker, step: Step) -> wire.Lease:
+def grant(state: State, job: JobState, worker: Worker, step: CoreStep) -> wire.Lease:
     """Lease a job that has just left the queue."""
     job.attempts += 1
     serial = 0 if worker.poll is None else worker.poll.serial
@@ -69,10 +69,12 @@ def grant(state: State, job: JobState, worker: Worker, step: Step) -> wire.Lease
     )
 
 
-def _enter(state: State, job: JobState, worker: Worker, attempt: int, step: Step, *, serial: int) -> Lease:
+def _enter(
+    state: State, job: JobState, worker: Worker, attempt: int, step: CoreStep, *, serial: int
+) -> OpenLease:
     now = step.now
     name = lease_id(job.group.flow.secret, job.job_id, attempt, worker.name)
-    lease = Lease(name, job, worker.name, attempt, granted_at=now, renewed=now, progress_at=now)
+    lease = OpenLease(name, job, worker.name, attempt, granted_at=now, renewed=now, progress_at=now)
     job.lease = lease
     job.move("leased")
     worker.leases[name] = lease
@@ -107,7 +109,7 @@ def let_go(state: State, group: JobGroup, now: float) -> None:
 
 
 def hear(
-    state: State, worker: Worker, held: Iterable[wire.HeldLease], step: Step, *, settled: int
+    state: State, worker: Worker, held: Iterable[wire.HeldLease], step: CoreStep, *, settled: int
 ) -> tuple[str, ...]:
     """Process a heartbeat: renew the named leases, adopt unknown ones whose job waits. Returns the leases that the
     worker is to stop. All polls of the worker up to number `settled` are finished."""
@@ -144,7 +146,7 @@ def hear(
     return tuple(stop)
 
 
-def _adopt(state: State, worker: Worker, item: wire.HeldLease, step: Step) -> Lease | None:
+def _adopt(state: State, worker: Worker, item: wire.HeldLease, step: CoreStep) -> OpenLease | None:
     """Adopt a lease of an earlier incarnation that a worker still holds; None when it must not continue."""
     job = state.jobs.get(item.job_id)
     if (
@@ -168,7 +170,7 @@ def _adopt(state: State, worker: Worker, item: wire.HeldLease, step: Step) -> Le
 # ---- giving up ----
 
 
-def end(state: State, lease: Lease) -> None:
+def end(state: State, lease: OpenLease) -> None:
     """The lease no longer counts. Its worker learns of it from its next heartbeat, or at once if one waits."""
     if not lease.live:
         return
@@ -183,21 +185,21 @@ def end(state: State, lease: Lease) -> None:
     worker.held[job.priority] -= 1
 
 
-def stop(state: State, lease: Lease, step: Step) -> None:
+def stop(state: State, lease: OpenLease, step: CoreStep) -> None:
     """End a lease that its worker still holds; a waiting poll or heartbeat is answered with it at
     the end of this step."""
     end(state, lease)
     step.stops.setdefault(lease.worker, []).append(lease.id)
 
 
-def release(state: State, worker: Worker, lease: Lease, step: Step, *, sure: bool = False) -> None:
+def release(state: State, worker: Worker, lease: OpenLease, step: CoreStep, *, sure: bool = False) -> None:
     """End a lease that its worker has released. `sure`: the worker reported so; otherwise it is the
     coordinator's assumption."""
     end(state, lease)
     _leave(state, worker, lease, step, sure=sure)
 
 
-def _leave(state: State, worker: Worker, lease: Lease, step: Step, *, sure: bool) -> None:
+def _leave(state: State, worker: Worker, lease: OpenLease, step: CoreStep, *, sure: bool) -> None:
     worker.leases.pop(lease.id, None)
     occupancies.vacate(state, lease, worker, step, sure=sure)
     if worker.alone is lease:
@@ -210,7 +212,7 @@ def give_back(
     job: JobState,
     failure: JobFailure,
     worker: Worker,
-    step: Step,
+    step: CoreStep,
     *,
     ran: bool,
     error: str = "",

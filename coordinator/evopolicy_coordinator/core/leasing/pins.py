@@ -13,7 +13,7 @@ from evopolicy_common.messages.environment import EnvironmentDescription
 from evopolicy_coordinator.core.leasing import fleet, queue
 from evopolicy_coordinator.core.tables.model import Flow, Profile, Run, Worker
 from evopolicy_coordinator.core.tables.state import State
-from evopolicy_coordinator.core.tables.step import FlowPinned, Step
+from evopolicy_coordinator.core.tables.step import CoreStep, FlowPinned
 
 
 def add_flow(state: State, flow: Flow) -> None:
@@ -32,7 +32,7 @@ def drop_flow(state: State, flow: Flow) -> None:
     state.case_sets.leave(flow.case_set)
 
 
-def pin(state: State, flow: Flow, step: Step) -> None:
+def pin(state: State, flow: Flow, step: CoreStep) -> None:
     """Pin a flow to the fingerprint class that serves it best now, if there is one."""
     profile = fleet.offer(state, flow) if flow.pin is None else None
     if profile is None:
@@ -42,13 +42,13 @@ def pin(state: State, flow: Flow, step: Step) -> None:
     step.tell(FlowPinned(flow, profile))
 
 
-def place(state: State, flow: Flow, fingerprint_class: str, step: Step) -> None:
+def place(state: State, flow: Flow, fingerprint_class: str, step: CoreStep) -> None:
     """Pin a flow to a class of workers; its waiting jobs then wait for them."""
     state.unpinned.pop(flow.id, None)
     step.dirty[queue.place(state, flow, fingerprint_class)] = None
 
 
-def pin_waiting(state: State, worker: Worker, step: Step) -> None:
+def pin_waiting(state: State, worker: Worker, step: CoreStep) -> None:
     """When a worker becomes available, pin the flows that no worker could serve before."""
     for flow in list(state.unpinned.values()):
         if worker.profile.offers(flow):

@@ -30,7 +30,7 @@ from evopolicy_coordinator.core.tables.model import (
     Worker,
 )
 from evopolicy_coordinator.core.tables.state import State
-from evopolicy_coordinator.core.tables.step import Step
+from evopolicy_coordinator.core.tables.step import CoreStep
 
 RECHECK_S = 1.0
 """A lane is checked again after this time when jobs wait although workers wait too (they avoid each other)."""
@@ -121,7 +121,7 @@ def _settle(lane: Lane) -> None:
 # ---- jobs ----
 
 
-def put(state: State, job: JobState, step: Step, *, front: bool = False) -> None:
+def put(state: State, job: JobState, step: CoreStep, *, front: bool = False) -> None:
     """Queue a job, and mark its lane for the scheduler."""
     flow, priority, lane = job.group.flow, job.priority, job.group.flow.lane
     job.move("queued")
@@ -304,14 +304,14 @@ def _next(flow: Flow, priority: int) -> JobState:
 # ---- jobs that return ----
 
 
-def backed_off(state: State, job_id: str, step: Step) -> None:
+def backed_off(state: State, job_id: str, step: CoreStep) -> None:
     """A job's back-off after an infrastructure failure is over."""
     job = state.jobs.get(job_id)
     if job is not None and job.place == "backing_off":
         put(state, job, step, front=True)
 
 
-def give_up_adopting(state: State, _what: str, step: Step) -> None:
+def give_up_adopting(state: State, _what: str, step: CoreStep) -> None:
     """No heartbeat has claimed these jobs since the core was loaded: play them again."""
     for job in list(state.adopting):
         del state.adopting[job]

@@ -19,10 +19,10 @@ from evopolicy_coordinator.core.runs import templates, waits
 from evopolicy_coordinator.core.structures.timers import Poll
 from evopolicy_coordinator.core.tables.model import Evaluation, Flow, JobGroup
 from evopolicy_coordinator.core.tables.state import State
-from evopolicy_coordinator.core.tables.step import EnvironmentFailed, EpisodesDone, FlowPinned, Step
+from evopolicy_coordinator.core.tables.step import CoreStep, EnvironmentFailed, EpisodesDone, FlowPinned
 
 
-def request(state: State, event: events.EvaluationRequested, step: Step) -> None:
+def request(state: State, event: events.EvaluationRequested, step: CoreStep) -> None:
     """Queue an operator's cases, once for each key."""
     row = event.row
     known = state.evaluation_keys.get(row.key)
@@ -58,12 +58,12 @@ def enter(state: State, row: EvaluationRow) -> Evaluation:
     return evaluation
 
 
-def queue_jobs(state: State, evaluation: Evaluation, step: Step) -> None:
+def queue_jobs(state: State, evaluation: Evaluation, step: CoreStep) -> None:
     group = templates.evaluation(evaluation, step)
     groups.open_group(state, group, step)
 
 
-def pinned(state: State, news: FlowPinned, step: Step) -> None:
+def pinned(state: State, news: FlowPinned, step: CoreStep) -> None:
     """Store the class of workers that an evaluation is pinned to."""
     evaluation = state.evaluations[news.flow.id]
     evaluation.row = msgspec.structs.replace(
@@ -72,7 +72,7 @@ def pinned(state: State, news: FlowPinned, step: Step) -> None:
     step.persist(evaluation.row)
 
 
-def progressed(state: State, news: EpisodesDone, step: Step) -> None:
+def progressed(state: State, news: EpisodesDone, step: CoreStep) -> None:
     """Episodes of an evaluation are done: answer waiting polls, and end it after the last one."""
     group = news.group
     if group.done == group.n:
@@ -81,13 +81,13 @@ def progressed(state: State, news: EpisodesDone, step: Step) -> None:
         _answer_polls(state, group, step, finished=False)
 
 
-def environment_failed(state: State, news: EnvironmentFailed, step: Step) -> None:
+def environment_failed(state: State, news: EnvironmentFailed, step: CoreStep) -> None:
     """The environment cannot play one of the episodes."""
     if news.group.run in state.evaluations:
         end(state, news.group, news.error, step)
 
 
-def cancel(state: State, name: str, step: Step) -> bool:
+def cancel(state: State, name: str, step: CoreStep) -> bool:
     """End a running evaluation; returns False when it is unknown."""
     if name not in state.evaluations:
         return name in state.ended_evaluations
@@ -95,7 +95,7 @@ def cancel(state: State, name: str, step: Step) -> bool:
     return True
 
 
-def end(state: State, group: JobGroup, error: str, step: Step) -> None:
+def end(state: State, group: JobGroup, error: str, step: CoreStep) -> None:
     """End an evaluation: close its group and answer waiting polls. `error` is the reason of an early end."""
     evaluation = state.evaluations.pop(group.run)
     step.persist(msgspec.structs.replace(evaluation.row, finished=True, error=error))
@@ -105,12 +105,12 @@ def end(state: State, group: JobGroup, error: str, step: Step) -> None:
     _answer_polls(state, group, step, finished=True)
 
 
-def _answer_polls(state: State, group: JobGroup, step: Step, *, finished: bool) -> None:
+def _answer_polls(state: State, group: JobGroup, step: CoreStep, *, finished: bool) -> None:
     for poll in state.polls.take_all(group.id):
         step.add(_page(state, poll, group, finished=finished))
 
 
-def polled(state: State, event: events.Requested[operator.EvaluationPoll], step: Step) -> None:
+def polled(state: State, event: events.Requested[operator.EvaluationPoll], step: CoreStep) -> None:
     """An operator polls for outcomes: answered at once, or when there are more than it has."""
     message = event.message
     poll = Poll(event.request, "evaluation", evaluation_group(message.evaluation), message.cursor)
@@ -125,7 +125,7 @@ def polled(state: State, event: events.Requested[operator.EvaluationPoll], step:
         step.add(_page(state, poll, group, finished=False))
 
 
-def answer(state: State, poll: Poll, step: Step) -> None:
+def answer(state: State, poll: Poll, step: CoreStep) -> None:
     """Answer a poll that has timed out."""
     step.add(_page(state, poll, state.groups[poll.target], finished=False))
 

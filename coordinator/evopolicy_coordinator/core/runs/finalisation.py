@@ -31,21 +31,21 @@ from evopolicy_coordinator.core.tables.model import JobGroup, Run
 from evopolicy_coordinator.core.tables.state import State
 from evopolicy_coordinator.core.tables.step import (
     AgentOverdue,
+    CoreStep,
     EnvironmentFailed,
     EpisodesDone,
-    Step,
     SubmitEnded,
 )
 
 # ---- hidden groups ----
 
 
-def _open(state: State, group: JobGroup, step: Step) -> None:
+def _open(state: State, group: JobGroup, step: CoreStep) -> None:
     if group.id not in state.groups:
         groups.open_group(state, group, step)
 
 
-def progressed(state: State, news: EpisodesDone, step: Step) -> None:
+def progressed(state: State, news: EpisodesDone, step: CoreStep) -> None:
     group = news.group
     if group.done < group.n:
         return
@@ -62,7 +62,7 @@ def progressed(state: State, news: EpisodesDone, step: Step) -> None:
     advance(state, run, step)
 
 
-def submit_ended(state: State, news: SubmitEnded, step: Step) -> None:
+def submit_ended(state: State, news: SubmitEnded, step: CoreStep) -> None:
     """A submit got its verdict: a closed run may advance."""
     advance(state, news.run, step)
 
@@ -70,7 +70,7 @@ def submit_ended(state: State, news: SubmitEnded, step: Step) -> None:
 # ---- stages ----
 
 
-def close(state: State, event: events.Requested[gateway.CloseRun], step: Step) -> None:
+def close(state: State, event: events.Requested[gateway.CloseRun], step: CoreStep) -> None:
     """The agent is gone: the run takes no more submits, and its hidden cases are played. A second
     close changes nothing."""
     message = event.message
@@ -88,7 +88,7 @@ def close(state: State, event: events.Requested[gateway.CloseRun], step: Step) -
     step.reply(event.request, gateway.RunClosed())
 
 
-def advance(state: State, run: Run, step: Step) -> None:
+def advance(state: State, run: Run, step: CoreStep) -> None:
     """Take a closed run through all stages that are possible now."""
     if run.state.phase != "closed" or run.open is not None:
         return
@@ -112,7 +112,7 @@ def advance(state: State, run: Run, step: Step) -> None:
         _finish(state, run, best, step)
 
 
-def cancel(state: State, event: events.Requested[operator.CancelRun], step: Step) -> None:
+def cancel(state: State, event: events.Requested[operator.CancelRun], step: CoreStep) -> None:
     """End a run at once on an operator's command; it is not scored. Also ends an evaluation of that name."""
     message = event.message
     if not evaluations.cancel(state, message.run, step):
@@ -122,7 +122,7 @@ def cancel(state: State, event: events.Requested[operator.CancelRun], step: Step
     step.reply(event.request, operator.Done())
 
 
-def agent_overdue(state: State, news: AgentOverdue, step: Step) -> None:
+def agent_overdue(state: State, news: AgentOverdue, step: CoreStep) -> None:
     """Cancel a run whose agent keeps hidden jobs of others waiting: its gateway ends the agent, as at any
     cancellation."""
     if news.run.id in state.runs:
@@ -135,7 +135,7 @@ def agent_overdue(state: State, news: AgentOverdue, step: Step) -> None:
         _cancel(state, news.run, step)
 
 
-def environment_failed(state: State, news: EnvironmentFailed, step: Step) -> None:
+def environment_failed(state: State, news: EnvironmentFailed, step: CoreStep) -> None:
     """End a run with an error, as its environment cannot play one of the episodes: its open submit is not charged."""
     run = state.runs.get(news.group.run)
     if run is not None:
@@ -143,7 +143,7 @@ def environment_failed(state: State, news: EnvironmentFailed, step: Step) -> Non
         _cancel(state, run, step, error=news.error)
 
 
-def _cancel(state: State, run: Run, step: Step, *, error: str | None = None) -> None:
+def _cancel(state: State, run: Run, step: CoreStep, *, error: str | None = None) -> None:
     if run.open is not None:
         index, run.open = run.open, None
         run.ledger.refund(index)
@@ -162,7 +162,7 @@ def _finish(
     state: State,
     run: Run,
     best: SubmitRow | None,
-    step: Step,
+    step: CoreStep,
     *,
     cancelled: bool = False,
     unplayed: bool = False,

@@ -19,7 +19,7 @@ from evopolicy_coordinator.core.runs import waits
 from evopolicy_coordinator.core.structures.timers import Poll
 from evopolicy_coordinator.core.tables.model import Run
 from evopolicy_coordinator.core.tables.state import State
-from evopolicy_coordinator.core.tables.step import Step
+from evopolicy_coordinator.core.tables.step import CoreStep
 
 
 def unspent(run: Run) -> int:
@@ -152,7 +152,7 @@ def result(
 # ---- waiting for the end ----
 
 
-def waited(state: State, event: events.Requested[operator.WaitRun], step: Step) -> None:
+def waited(state: State, event: events.Requested[operator.WaitRun], step: CoreStep) -> None:
     message = event.message
     run = requests.known_run(state, message.run)
     if run is None:
@@ -163,7 +163,7 @@ def waited(state: State, event: events.Requested[operator.WaitRun], step: Step) 
         step.reply(event.request, *progress(state, run))
 
 
-def answer(state: State, poll: Poll, step: Step) -> None:
+def answer(state: State, poll: Poll, step: CoreStep) -> None:
     """An operator's wait for the end of a run has timed out."""
     step.reply(poll.request, *progress(state, state.runs[poll.target]))
 

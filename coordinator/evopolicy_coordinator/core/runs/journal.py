@@ -17,7 +17,7 @@ from evopolicy_coordinator.core.contract import events
 from evopolicy_coordinator.core.contract.reasons import NotDoneError
 from evopolicy_coordinator.core.contract.records import DocumentRow, JournalRow, RunRow
 from evopolicy_coordinator.core.tables.state import State
-from evopolicy_coordinator.core.tables.step import Step
+from evopolicy_coordinator.core.tables.step import CoreStep
 
 
 def check_epoch(state: State, row: RunRow) -> None:
@@ -26,7 +26,7 @@ def check_epoch(state: State, row: RunRow) -> None:
         raise NotDoneError("epoch_revealed", epoch=row.epoch)
 
 
-def opened(state: State, row: RunRow, step: Step) -> Committed:
+def opened(state: State, row: RunRow, step: CoreStep) -> Committed:
     """Commit to a run that is about to be created."""
     opening = journal.Opening(**{name: getattr(row, name) for name in journal.Opening.__struct_fields__})
     # The document is published unchanged, so it leaves out the operator's private labels and machine.
@@ -52,7 +52,7 @@ def opened(state: State, row: RunRow, step: Step) -> Committed:
     return Committed(commitment=commitment, epoch=row.epoch, opened=last.seq, opened_head=last.head)
 
 
-def ended(state: State, finished: RunFinished, step: Step) -> RunFinished:
+def ended(state: State, finished: RunFinished, step: CoreStep) -> RunFinished:
     """Commit to a run's result."""
     document = journal.document(finished.result)
     step.persist(DocumentRow(run=finished.run, kind="result", data=document))
@@ -64,7 +64,7 @@ def ended(state: State, finished: RunFinished, step: Step) -> RunFinished:
     return msgspec.structs.replace(finished, committed=place)
 
 
-def disclose(state: State, event: events.DisclosureRequested, step: Step) -> None:
+def disclose(state: State, event: events.DisclosureRequested, step: CoreStep) -> None:
     """Reveal the epochs of runs that are to be published. Refuses (BUSY) while a run of them is unfinished.
     Revealed epochs stay so."""
     for run in state.runs.values():
@@ -78,7 +78,7 @@ def disclose(state: State, event: events.DisclosureRequested, step: Step) -> Non
     step.reply(event.request, Done())
 
 
-def _append(state: State, entry: journal.EpochEntry, step: Step, reveals: str = "") -> JournalRow:
+def _append(state: State, entry: journal.EpochEntry, step: CoreStep, reveals: str = "") -> JournalRow:
     last = state.journal
     data = journal.document(entry)
     head = journal.EMPTY_HEAD if last is None else last.head

@@ -24,13 +24,19 @@ from evopolicy_coordinator.core.runs import journal, waits
 from evopolicy_coordinator.core.structures.ledger import Ledger
 from evopolicy_coordinator.core.tables.model import Flow, Run
 from evopolicy_coordinator.core.tables.state import State
-from evopolicy_coordinator.core.tables.step import EpisodesDone, FlowPinned, JobRetried, ResultsDiffered, Step
+from evopolicy_coordinator.core.tables.step import (
+    CoreStep,
+    EpisodesDone,
+    FlowPinned,
+    JobRetried,
+    ResultsDiffered,
+)
 
 MOST_INSTALLATIONS = 64
 """A run's record names no more: a worker may register as often as it wants, each time with another one."""
 
 
-def create(state: State, event: events.RunRequested, step: Step) -> None:
+def create(state: State, event: events.RunRequested, step: CoreStep) -> None:
     """Create a run, once for each key."""
     row = event.row
     known = state.run_keys.get(row.key)
@@ -95,7 +101,7 @@ def _check(row: RunRow) -> None:
 # ---- requests of gateways ----
 
 
-def opened(state: State, event: events.Requested[gateway.OpenRun], step: Step) -> None:
+def opened(state: State, event: events.Requested[gateway.OpenRun], step: CoreStep) -> None:
     """Send a gateway the fixed parameters of its run; refused until a worker has offered the environment."""
     run = requests.live(state, event.message.run)
     if run.flow.pin is None:
@@ -127,7 +133,7 @@ def opened(state: State, event: events.Requested[gateway.OpenRun], step: Step) -
     )
 
 
-def state_requested(state: State, event: events.Requested[gateway.StateRequest], step: Step) -> None:
+def state_requested(state: State, event: events.Requested[gateway.StateRequest], step: CoreStep) -> None:
     """Send a gateway the state of its run, also after it is finished."""
     last = state.finished.get(event.message.run)
     if last is not None:
@@ -170,7 +176,7 @@ def run_state(state: State, run: Run, now: float) -> tuple[gateway.RunState, Rea
 # ---- news ----
 
 
-def pinned(state: State, news: FlowPinned, step: Step) -> None:
+def pinned(state: State, news: FlowPinned, step: CoreStep) -> None:
     """Store the class of workers that a run is pinned to."""
     run, profile = state.runs[news.flow.id], news.profile
     step.change_run(
@@ -182,7 +188,7 @@ def pinned(state: State, news: FlowPinned, step: Step) -> None:
     step.log("info", "run_pinned", run=run.id, fingerprint_class=profile.classes[news.flow.env])
 
 
-def played(state: State, news: EpisodesDone, step: Step) -> None:
+def played(state: State, news: EpisodesDone, step: CoreStep) -> None:
     """Note the installation of a worker that has played some of a run's episodes."""
     run, name = state.runs.get(news.group.run), "" if news.worker is None else news.worker.installation
     if run is not None and name:
@@ -191,7 +197,7 @@ def played(state: State, news: EpisodesDone, step: Step) -> None:
             step.change_run(run, installations=(*known, name))
 
 
-def retried(state: State, news: JobRetried, step: Step) -> None:
+def retried(state: State, news: JobRetried, step: CoreStep) -> None:
     """Count an infrastructure retry, and keep the last ones for operators; `run.json` has the total."""
     run = state.runs.get(news.job.group.run)
     if run is None:
@@ -204,7 +210,7 @@ def retried(state: State, news: JobRetried, step: Step) -> None:
     run.retries.append(one)
 
 
-def differed(state: State, news: ResultsDiffered, step: Step) -> None:
+def differed(state: State, news: ResultsDiffered, step: CoreStep) -> None:
     """Count two differing results of one episode; `run.json` has the total."""
     run = state.runs.get(news.group.run)
     if run is not None:

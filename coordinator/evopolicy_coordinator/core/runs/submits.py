@@ -30,10 +30,10 @@ from evopolicy_coordinator.core.structures.ledger import check_request
 from evopolicy_coordinator.core.structures.timers import Poll
 from evopolicy_coordinator.core.tables.model import JobGroup, Run
 from evopolicy_coordinator.core.tables.state import State
-from evopolicy_coordinator.core.tables.step import EpisodesDone, Step, SubmitEnded
+from evopolicy_coordinator.core.tables.step import CoreStep, EpisodesDone, SubmitEnded
 
 
-def submit(state: State, event: events.Requested[gateway.Submit], step: Step) -> None:
+def submit(state: State, event: events.Requested[gateway.Submit], step: CoreStep) -> None:
     """Accept a submit, or refuse it for the first cause in the protocol's order; the same request with a known key
     gets the earlier answer."""
     message = event.message
@@ -63,7 +63,7 @@ def submit(state: State, event: events.Requested[gateway.Submit], step: Step) ->
     _accept(state, run, event, step)
 
 
-def _accept(state: State, run: Run, event: events.Requested[gateway.Submit], step: Step) -> None:
+def _accept(state: State, run: Run, event: events.Requested[gateway.Submit], step: CoreStep) -> None:
     message = event.message
     index, n = len(run.submits), len(message.env_instances)
     first_global_episode = run.ledger.spent
@@ -97,7 +97,7 @@ def _accept(state: State, run: Run, event: events.Requested[gateway.Submit], ste
     queue_jobs(state, run, row, step)
 
 
-def queue_jobs(state: State, run: Run, row: SubmitRow, step: Step) -> None:
+def queue_jobs(state: State, run: Run, row: SubmitRow, step: CoreStep) -> None:
     """Queue the unfinished jobs of an open submit."""
     groups.open_group(state, templates.train(run, row, step), step)
 
@@ -105,7 +105,7 @@ def queue_jobs(state: State, run: Run, row: SubmitRow, step: Step) -> None:
 # ---- progress and end of a submit ----
 
 
-def progressed(state: State, news: EpisodesDone, step: Step) -> None:
+def progressed(state: State, news: EpisodesDone, step: CoreStep) -> None:
     group = news.group
     run = state.runs[group.run]
     for outcome in news.outcomes:
@@ -129,7 +129,7 @@ def progressed(state: State, news: EpisodesDone, step: Step) -> None:
     end(state, run, group, "rollout_timeout", failure, step)
 
 
-def limit_passed(state: State, name: str, step: Step) -> None:
+def limit_passed(state: State, name: str, step: CoreStep) -> None:
     """The deadline of the operator's limit on a submit's wall time; extended by the time for which it was held, and by
     another such limit after faults of ours in episodes that are not done."""
     group = state.groups.get(name)
@@ -156,7 +156,12 @@ def limit_passed(state: State, name: str, step: Step) -> None:
 
 
 def end(
-    state: State, run: Run, group: JobGroup, status: SubmitStatus, failure: PolicyFailure | None, step: Step
+    state: State,
+    run: Run,
+    group: JobGroup,
+    status: SubmitStatus,
+    failure: PolicyFailure | None,
+    step: CoreStep,
 ) -> None:
     """Settle a submit with its verdict."""
     n_kept = 0
@@ -187,7 +192,7 @@ def end(
     step.tell(SubmitEnded(run, row))
 
 
-def results(state: State, event: events.Requested[gateway.ResultsRequest], step: Step) -> None:
+def results(state: State, event: events.Requested[gateway.ResultsRequest], step: CoreStep) -> None:
     """A gateway polls for outcomes: answered at once, or when there are more than it has."""
     message = event.message
     run = requests.known_run(state, message.run)
@@ -218,13 +223,13 @@ def _released(state: State, target: str) -> int:
     return group.done if 0 in group.digests else 0
 
 
-def answer_polls(state: State, group: JobGroup, step: Step) -> None:
+def answer_polls(state: State, group: JobGroup, step: CoreStep) -> None:
     """Answer the polls that wait for a submit's new results."""
     for poll in state.polls.take_all(group.id):
         answer(state, poll, step)
 
 
-def answer(state: State, poll: Poll, step: Step) -> None:
+def answer(state: State, poll: Poll, step: CoreStep) -> None:
     run = state.runs[poll.target.split("/")[0]]
     index = int(poll.target.split("/")[1][1:])
     row = run.submits[index]

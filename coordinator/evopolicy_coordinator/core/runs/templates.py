@@ -30,12 +30,12 @@ from evopolicy_coordinator.core.tables.model import (
     Run,
     Template,
 )
-from evopolicy_coordinator.core.tables.step import Step
+from evopolicy_coordinator.core.tables.step import CoreStep
 
 HIDDEN_SPLITS = ("validation", "heldout")
 
 
-def train(run: Run, row: SubmitRow, step: Step) -> JobGroup:
+def train(run: Run, row: SubmitRow, step: CoreStep) -> JobGroup:
     return _group(
         "train",
         run,
@@ -57,7 +57,7 @@ def train(run: Run, row: SubmitRow, step: Step) -> JobGroup:
     )
 
 
-def hidden(split: Literal["validation", "heldout"], run: Run, row: SubmitRow, step: Step) -> JobGroup:
+def hidden(split: Literal["validation", "heldout"], run: Run, row: SubmitRow, step: CoreStep) -> JobGroup:
     """A checkpoint on all cases of a hidden split."""
     settings, cases = run.row.settings, run.row.cases(split)
     pool = settings.hidden_evaluation == "pool"
@@ -79,7 +79,7 @@ def hidden(split: Literal["validation", "heldout"], run: Run, row: SubmitRow, st
     )
 
 
-def random(run: Run, step: Step) -> JobGroup:
+def random(run: Run, step: CoreStep) -> JobGroup:
     """Uniform random actions on all held-out cases."""
     return _group(
         "random",
@@ -96,7 +96,7 @@ def random(run: Run, step: Step) -> JobGroup:
     )
 
 
-def evaluation(of: Evaluation, step: Step) -> JobGroup:
+def evaluation(of: Evaluation, step: CoreStep) -> JobGroup:
     """The episodes that an operator requested."""
     # A replayed list keeps its position in its run; any other is a list of its own.
     row, place = of.row, _place(of.row)
@@ -135,7 +135,7 @@ def _group(
     kind: GroupKind,
     owner: Run | Evaluation,
     cases: tuple[Case, ...],
-    step: Step,
+    step: CoreStep,
     *,
     id: str,
     submit_index: int,

@@ -174,7 +174,7 @@ class JobState:
     """Incremented whenever the job enters or leaves the queue; queue entries with an older generation are void."""
     place: Place = "new"
     """`JOB` lists the allowed successors."""
-    lease: Lease | None = None
+    lease: OpenLease | None = None
     failures: int = 0
     """Infrastructure failures so far, in this incarnation."""
     failures_counted: int = 0
@@ -292,7 +292,7 @@ class JobGroup:
 
 
 @dataclass(slots=True, eq=False)
-class Lease:
+class OpenLease:
     """The right to play one attempt of a job."""
 
     id: str
@@ -506,7 +506,7 @@ class Occupancy:
     case_set: CaseSet | None
     """None: not known, so related to all."""
     hidden: bool
-    lease: Lease | None
+    lease: OpenLease | None
     """None once the coordinator has given it up, or if it never granted it."""
     serial: int = 0
     """Number of the poll that it was granted to; 0: it had arrived before the worker's first request."""
@@ -586,7 +586,7 @@ class Worker:
     missing_tiers: dict[str, str] = field(default_factory=dict)
     """Sandbox tiers that should work there and do not, with the reasons."""
     state: Literal["active", "paused", "draining", "lost"] = "active"
-    leases: dict[str, Lease] = field(default_factory=dict)
+    leases: dict[str, OpenLease] = field(default_factory=dict)
     """By id, oldest first; also given-up ones until the worker no longer names them."""
     held: list[int] = field(default_factory=partial(by_priority, int))
     """Live leases by priority."""
@@ -600,7 +600,7 @@ class Worker:
     """When its liveliness token disappeared; None while it exists, or after a later request."""
     reserved: JobState | None = None
     """The suspect that it is being emptied for."""
-    alone: Lease | None = None
+    alone: OpenLease | None = None
     """The suspect that it plays, with no other job beside it."""
     failures: int = 0
     """Consecutive jobs that failed through its own fault."""
@@ -612,7 +612,7 @@ class Worker:
     told_size: int = 0
     """Characters of `undescribed` and `failed_environments`."""
 
-    def running(self) -> list[Lease]:
+    def running(self) -> list[OpenLease]:
         """Leases that it plays now: as its heartbeats reported, or, before a report, the oldest, one per slot."""
         reported = [lease for lease in self.leases.values() if lease.running]
         return reported or list(self.leases.values())[: self.slots]

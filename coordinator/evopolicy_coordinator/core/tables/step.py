@@ -118,7 +118,7 @@ News = (
 # ---- steps ----
 
 
-class Step:
+class CoreStep:
     """Collects the effects of one step, its news, and the marks for the scheduler."""
 
     __slots__ = ("_out", "_rows", "dirty", "grown", "last", "news", "now", "stimulus_id", "stops")

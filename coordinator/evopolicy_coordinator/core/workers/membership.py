@@ -24,11 +24,11 @@ from evopolicy_coordinator.core.leasing import fleet, leases, pins
 from evopolicy_coordinator.core.leasing.jobs import JobFailure
 from evopolicy_coordinator.core.tables.model import Profile, Worker
 from evopolicy_coordinator.core.tables.state import State
-from evopolicy_coordinator.core.tables.step import ResultsPersisted, Step
+from evopolicy_coordinator.core.tables.step import CoreStep, ResultsPersisted
 from evopolicy_coordinator.core.workers import scheduler
 
 
-def registered(state: State, event: events.WorkerRegistered, step: Step) -> None:
+def registered(state: State, event: events.WorkerRegistered, step: CoreStep) -> None:
     """A worker joins, or joins again under a new session."""
     message = event.message
     old = state.workers.get(message.worker)
@@ -60,7 +60,9 @@ def registered(state: State, event: events.WorkerRegistered, step: Step) -> None
 
 
 def worker_of(
-    state: State, event: events.Requested[wire.LeaseRequest | wire.Heartbeat | wire.ReportResults], step: Step
+    state: State,
+    event: events.Requested[wire.LeaseRequest | wire.Heartbeat | wire.ReportResults],
+    step: CoreStep,
 ) -> Worker:
     """Returns the worker that sent the request. Raises NotDoneError when its session is unknown."""
     message = event.message
@@ -75,11 +77,11 @@ def worker_of(
     return worker
 
 
-def lease_requested(state: State, event: events.Requested[wire.LeaseRequest], step: Step) -> None:
+def lease_requested(state: State, event: events.Requested[wire.LeaseRequest], step: CoreStep) -> None:
     scheduler.poll(state, worker_of(state, event, step), event, step)
 
 
-def heartbeat(state: State, event: events.Requested[wire.Heartbeat], step: Step) -> None:
+def heartbeat(state: State, event: events.Requested[wire.Heartbeat], step: CoreStep) -> None:
     """Renew the leases that a worker names, and reply with those to stop."""
     message = event.message
     worker = worker_of(state, event, step)
@@ -92,7 +94,7 @@ def heartbeat(state: State, event: events.Requested[wire.Heartbeat], step: Step)
         state.timers.arm(("beat", worker.name), step.now + min(message.wait_s, state.settings.max_wait_s))
 
 
-def results_reported(state: State, event: events.Requested[wire.ReportResults], step: Step) -> None:
+def results_reported(state: State, event: events.Requested[wire.ReportResults], step: CoreStep) -> None:
     """Take results, and answer once they are durable."""
     worker = worker_of(state, event, step)
     for result in event.message.results:
@@ -100,7 +102,7 @@ def results_reported(state: State, event: events.Requested[wire.ReportResults], 
     step.reply_last(event.request, wire.ResultsReported(n=len(event.message.results)))
 
 
-def liveness_lost(state: State, event: events.LivenessLost, step: Step) -> None:
+def liveness_lost(state: State, event: events.LivenessLost, step: CoreStep) -> None:
     """Check the worker's leases sooner than otherwise; a hint only."""
     worker = state.workers.get(event.worker)
     if worker is not None and worker.state != "lost" and worker.doubted_at is None:
@@ -108,7 +110,7 @@ def liveness_lost(state: State, event: events.LivenessLost, step: Step) -> None:
         state.timers.arm(("worker", worker.name), step.now + state.settings.liveness_grace_s)
 
 
-def worker_state(state: State, event: events.Requested[operator.SetWorker], step: Step) -> None:
+def worker_state(state: State, event: events.Requested[operator.SetWorker], step: CoreStep) -> None:
     """Drain, pause or reactivate a worker; durable, also for one that is not connected."""
     message = event.message
     step.persist(WorkerRow(worker=message.worker, state=message.state))
@@ -125,7 +127,7 @@ def worker_state(state: State, event: events.Requested[operator.SetWorker], step
     step.reply(event.request, operator.Done())
 
 
-def repinned(state: State, event: events.Requested[operator.RepinRun], step: Step) -> None:
+def repinned(state: State, event: events.Requested[operator.RepinRun], step: CoreStep) -> None:
     """Pin an unfinished run to another class of workers on an operator's command."""
     message = event.message
     run = state.runs.get(message.run)
@@ -159,7 +161,7 @@ def _class_of_worker(state: State, profile: Profile) -> str:
     return profile.fingerprint.class_name(cpu=state.settings.fingerprint_cpu)
 
 
-def forget(state: State, name: str, _step: Step) -> None:
+def forget(state: State, name: str, _step: CoreStep) -> None:
     """The deadline of a worker that was lost long ago."""
     worker = state.workers.get(name)
     if worker is not None and worker.state == "lost":
@@ -171,7 +173,7 @@ FORGET_S = 3600.0
 """A lost worker is listed for this long."""
 
 
-def check_due(state: State, name: str, step: Step) -> None:
+def check_due(state: State, name: str, step: CoreStep) -> None:
     """A worker's deadline: give up expired leases, declare a silent worker lost, and set the next deadline."""
     worker, settings, now = state.workers.get(name), state.settings, step.now
     if worker is None:
@@ -209,7 +211,7 @@ def check_due(state: State, name: str, step: Step) -> None:
         state.timers.arm(("worker", worker.name), min(deadlines))
 
 
-def lose(state: State, worker: Worker, step: Step) -> None:
+def lose(state: State, worker: Worker, step: CoreStep) -> None:
     """Declare a silent worker lost: all its jobs go back, and those that it was playing become suspects."""
     running = {lease.id for lease in worker.running()}
     fleet.count_out(worker)
@@ -219,7 +221,7 @@ def lose(state: State, worker: Worker, step: Step) -> None:
 
 
 def _take_all(
-    state: State, worker: Worker, failure: JobFailure, stop: tuple[str, ...], ran: set[str], step: Step
+    state: State, worker: Worker, failure: JobFailure, stop: tuple[str, ...], ran: set[str], step: CoreStep
 ) -> None:
     """Answer a worker's poll and heartbeat, with the leases to stop, and put all its jobs back."""
     fleet.drop_poll(state, worker, step)

@@ -25,14 +25,14 @@ from evopolicy_common.messages.worker import JobResult
 from evopolicy_coordinator.core.contract.records import BegunRow, OutcomeRow
 from evopolicy_coordinator.core.leasing import fleet, groups, jobs, leases
 from evopolicy_coordinator.core.leasing.jobs import JobFailure
-from evopolicy_coordinator.core.tables.model import JobState, Lease, Worker, outcome_digest
+from evopolicy_coordinator.core.tables.model import JobState, OpenLease, Worker, outcome_digest
 from evopolicy_coordinator.core.tables.state import State
 from evopolicy_coordinator.core.tables.step import (
+    CoreStep,
     EnvironmentFailed,
     EpisodesDone,
     ResultsDiffered,
     ResultsPersisted,
-    Step,
 )
 
 MAX_OUTCOME_BYTES = 2 << 20
@@ -41,7 +41,7 @@ one episode, whatever its size, so a run with a larger outcome could never tell 
 MAX_LENGTH = 2**31 - 1
 
 
-def take_results(state: State, news: ResultsPersisted, step: Step) -> None:
+def take_results(state: State, news: ResultsPersisted, step: CoreStep) -> None:
     worker, result = news.worker, news.result
     job = state.jobs.get(result.job_id)
     lease = worker.leases.get(result.lease_id)
@@ -68,7 +68,7 @@ def take_results(state: State, news: ResultsPersisted, step: Step) -> None:
             _environment_fault(state, worker, job, result.error, step)
 
 
-def _environment_fault(state: State, worker: Worker, job: JobState, error: str, step: Step) -> None:
+def _environment_fault(state: State, worker: Worker, job: JobState, error: str, step: CoreStep) -> None:
     """Count an attempt that the environment has ended; give the environment up after enough of them."""
     faults, lane = job.faults, job.group.flow.lane
     faults.n += 1
@@ -80,7 +80,9 @@ def _environment_fault(state: State, worker: Worker, job: JobState, error: str, 
         step.tell(EnvironmentFailed(job.group, f"{error}; {faults.n} attempts at {job.job_id} ended so"))
 
 
-def _keep_begun(job: JobState, lease: Lease | None, result: JobResult, step: Step, *, silent: bool) -> None:
+def _keep_begun(
+    job: JobState, lease: OpenLease | None, result: JobResult, step: CoreStep, *, silent: bool
+) -> None:
     """Keep the actions of an unfinished attempt's policy for the next attempt, unless that plays already."""
     kept = result.begun is not None and not (silent and result.limit_verdict)
     if kept and job.lease in (None, lease) and result.attempt > job.begun_attempt:
@@ -90,7 +92,13 @@ def _keep_begun(job: JobState, lease: Lease | None, result: JobResult, step: Ste
 
 
 def _closed(
-    state: State, worker: Worker, lease: Lease | None, result: JobResult, step: Step, *, granted: bool
+    state: State,
+    worker: Worker,
+    lease: OpenLease | None,
+    result: JobResult,
+    step: CoreStep,
+    *,
+    granted: bool,
 ) -> None:
     """Process a result of a job that is done or was cancelled, or of a lease that this worker was not granted."""
     if lease is not None:
@@ -123,7 +131,7 @@ def _closed(
             step.tell(ResultsDiffered(group))
 
 
-def _silent(state: State, lease: Lease, now: float) -> bool:
+def _silent(state: State, lease: OpenLease, now: float) -> bool:
     """Whether the holder of a lease may have been frozen during it."""
     if lease.job.failures >= state.settings.doubts_max:
         return False
@@ -176,7 +184,7 @@ def _done(
     worker: Worker,
     job: JobState,
     result: JobResult,
-    step: Step,
+    step: CoreStep,
     *,
     live: bool,
     silent: bool,
@@ -200,7 +208,7 @@ def _done(
 
 
 def _commit(
-    state: State, worker: Worker, job: JobState, result: JobResult, step: Step, leased_s: float | None
+    state: State, worker: Worker, job: JobState, result: JobResult, step: CoreStep, leased_s: float | None
 ) -> None:
     """Make the outcomes durable, and close the job. `leased_s`: how long the worker has had it; None: unknown."""
     group = job.group

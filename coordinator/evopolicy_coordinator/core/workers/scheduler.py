@@ -26,7 +26,7 @@ from evopolicy_coordinator.core.isolation import conflicts
 from evopolicy_coordinator.core.leasing import fleet, leases, queue
 from evopolicy_coordinator.core.tables.model import JobState, Lane, LeasePoll, Worker
 from evopolicy_coordinator.core.tables.state import State
-from evopolicy_coordinator.core.tables.step import Step
+from evopolicy_coordinator.core.tables.step import CoreStep
 
 PREFETCH_BELOW_S = 1.0
 """Longer episodes are leased to free slots only: the time to fetch them is negligible beside their play time."""
@@ -50,7 +50,7 @@ HELD_MAX = 16_384
 """Most leases that a worker may hold: its heartbeats name them all."""
 
 
-def poll(state: State, worker: Worker, event: Requested[wire.LeaseRequest], step: Step) -> None:
+def poll(state: State, worker: Worker, event: Requested[wire.LeaseRequest], step: CoreStep) -> None:
     """A worker polls for leases; an older poll of it is answered with none."""
     message = event.message
     fleet.drop_poll(state, worker, step)
@@ -69,7 +69,7 @@ def poll(state: State, worker: Worker, event: Requested[wire.LeaseRequest], step
         _park(state, worker, step)
 
 
-def _park(state: State, worker: Worker, step: Step) -> None:
+def _park(state: State, worker: Worker, step: CoreStep) -> None:
     """Park a worker's poll for new work, if it has a free slot. Otherwise its next free slot
     brings the poll up again."""
     if worker.n_live >= worker.slots or worker.reserved is not None:
@@ -81,7 +81,7 @@ def _park(state: State, worker: Worker, step: Step) -> None:
         state.timers.arm_once(("lane", lane.key), step.now + queue.RECHECK_S)
 
 
-def _serve(state: State, worker: Worker, step: Step) -> bool:
+def _serve(state: State, worker: Worker, step: CoreStep) -> bool:
     """Answer a worker's poll if there are leases for it; returns whether it was answered."""
     granted = _fill(state, worker, step)
     if granted:
@@ -89,7 +89,7 @@ def _serve(state: State, worker: Worker, step: Step) -> bool:
     return bool(granted)
 
 
-def _fill(state: State, worker: Worker, step: Step) -> list[wire.Lease]:
+def _fill(state: State, worker: Worker, step: CoreStep) -> list[wire.Lease]:
     poll = worker.poll
     if poll is None or not fleet.available(worker, step.now):
         return []
@@ -136,7 +136,7 @@ def _limit(state: State, worker: Worker, n: int, free: int) -> int:
 # ---- the end of a step ----
 
 
-def dispatch(state: State, step: Step) -> None:
+def dispatch(state: State, step: CoreStep) -> None:
     """Lease the work that this step made available."""
     if state.grantable:
         permits.settle(state, step)
@@ -158,7 +158,7 @@ def dispatch(state: State, step: Step) -> None:
         _tell_stops(state, name, tuple(stops), step)
 
 
-def _place_suspects(state: State, step: Step) -> None:
+def _place_suspects(state: State, step: CoreStep) -> None:
     """Offer waiting suspects to idle workers."""
     for job in list(islice(state.suspects, SUSPECTS_MAX)):
         lane = job.group.flow.lane
@@ -170,7 +170,7 @@ def _place_suspects(state: State, step: Step) -> None:
                         _to_the_back(state, worker, step)
 
 
-def _tell_stops(state: State, name: str, stops: tuple[str, ...], step: Step) -> None:
+def _tell_stops(state: State, name: str, stops: tuple[str, ...], step: CoreStep) -> None:
     """Notify a worker of leases to stop if a heartbeat or poll of it waits; otherwise its next heartbeat does so."""
     worker = state.workers.get(name)
     if worker is None:
@@ -181,7 +181,7 @@ def _tell_stops(state: State, name: str, stops: tuple[str, ...], step: Step) -> 
         fleet.answer_poll(state, worker, (), step, stops)
 
 
-def reconsider(state: State, worker: Worker, step: Step) -> None:
+def reconsider(state: State, worker: Worker, step: CoreStep) -> None:
     """Serve a waiting poll of a worker that may have become available."""
     if worker.poll is None or not fleet.available(worker, step.now):
         return
@@ -189,14 +189,14 @@ def reconsider(state: State, worker: Worker, step: Step) -> None:
         _park(state, worker, step)
 
 
-def bench_ended(state: State, name: str, step: Step) -> None:
+def bench_ended(state: State, name: str, step: CoreStep) -> None:
     """A worker's bench time is over."""
     worker = state.workers.get(name)
     if worker is not None:
         reconsider(state, worker, step)
 
 
-def _feed(state: State, lane: Lane, step: Step) -> None:
+def _feed(state: State, lane: Lane, step: CoreStep) -> None:
     """Answer parked polls while the lane has jobs for them."""
     tries = 0
     while any(lane.n_ready) and tries < TRIES_MAX:
@@ -212,7 +212,7 @@ def _feed(state: State, lane: Lane, step: Step) -> None:
         state.timers.arm_once(("lane", lane.key), step.now + queue.RECHECK_S)
 
 
-def _to_the_back(state: State, worker: Worker, step: Step) -> None:
+def _to_the_back(state: State, worker: Worker, step: CoreStep) -> None:
     fleet.unpark(worker)
     _park(state, worker, step)
 
@@ -235,7 +235,7 @@ def _parked(state: State, lane: Lane) -> Worker | None:
     return None
 
 
-def _next_suspect(state: State, worker: Worker, step: Step) -> wire.Lease | None:
+def _next_suspect(state: State, worker: Worker, step: CoreStep) -> wire.Lease | None:
     """Lease a suspect to an idle worker; a busy worker may be reserved for one instead (returns None)."""
     idle = not worker.leases
     if worker.reserved is not None:
@@ -267,7 +267,7 @@ def _barred(state: State, job: JobState, worker: Worker) -> bool:
     return conflicts.conflict(state, job.priority, job.group.flow.case_set, worker)
 
 
-def _alone(state: State, job: JobState, worker: Worker, step: Step) -> wire.Lease:
+def _alone(state: State, job: JobState, worker: Worker, step: CoreStep) -> wire.Lease:
     fleet.unreserve(state, job)
     queue.withdraw(state, job)
     return leases.grant(state, job, worker, step)

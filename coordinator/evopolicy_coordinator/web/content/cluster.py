@@ -29,7 +29,7 @@ STALE_S = 90.0
 """Age in seconds after which the last reply is no longer used."""
 
 
-class Cluster:
+class ShownCluster:
     """The latest status of a cluster."""
 
     def __init__(self, credentials: Credentials) -> None:

@@ -18,7 +18,7 @@ from evopolicy_common.records.words import in_words
 from evopolicy_common.terminal import short
 from evopolicy_coordinator.web.content.run_folders import key_of
 from evopolicy_results import html
-from evopolicy_results.html import View
+from evopolicy_results.html import PageView
 
 T = TypeVar("T")
 
@@ -76,7 +76,7 @@ def part(name: str, /, **values: object) -> str:
     return html.part(name, **values) if macro is None else str(macro(**values))
 
 
-def page(template: str, *, view: View | None = None, **values: object) -> str:
+def page(template: str, *, view: PageView | None = None, **values: object) -> str:
     """A whole page; the elements of its `view` are kept up to date."""
     live = "" if view is None else " ".join(view.elements())
     return html.page(template, view=view, own=_environment(), live=live, frame="web.html.j2", **values)

@@ -22,17 +22,17 @@ from evopolicy_common.errors import DECODE_ERRORS, BundleError
 from evopolicy_common.messages.bounds import LARGEST
 from evopolicy_common.messages.gateway import SubmitAccepted
 from evopolicy_common.records import open_run
-from evopolicy_common.records.agent_log import Part, parts
+from evopolicy_common.records.agent_log import LogPart, parts
 from evopolicy_common.records.blobs import is_digest
 from evopolicy_common.records.episodes.npz import read_arrays
 from evopolicy_common.records.json_text import objects
-from evopolicy_common.records.open_run import Requested
+from evopolicy_common.records.open_run import SubmitRequested
 from evopolicy_common.records.policies import bundles
 from evopolicy_common.records.policies.checkpoints import METADATA
 from evopolicy_common.records.words import in_words
 from evopolicy_common.regular_files import Confined, NotThereError
 from evopolicy_common.terminal import event_text
-from evopolicy_results.figures.line_chart import Line
+from evopolicy_results.figures.line_chart import ChartLine
 
 MAX_TEXT = 256 << 10
 """Characters of one file, or of one text, that are shown."""
@@ -69,7 +69,7 @@ class CodeFile(msgspec.Struct, frozen=True, kw_only=True):
     """None for one that is no text, or too large."""
 
 
-class Message(msgspec.Struct, frozen=True, kw_only=True):
+class LogMessage(msgspec.Struct, frozen=True, kw_only=True):
     """One entry of the agent's log."""
 
     at: int
@@ -117,7 +117,7 @@ class Detail:
                 entry = open_run.line_decoder.decode(line)
             except DECODE_ERRORS:
                 continue
-            if isinstance(entry, Requested):
+            if isinstance(entry, SubmitRequested):
                 digest = entry.submit.bundle or entry.kept
             elif isinstance(entry, SubmitAccepted) and entry.submit_index == index:
                 return digest if digest is not None and is_digest(digest) else None
@@ -168,7 +168,7 @@ class Detail:
         """The beginning of a file as text; empty where there is none."""
         return self.files.read_file(path, MAX_TEXT).decode("utf-8", "replace")
 
-    def played(self, folder: str) -> tuple[int, dict[str, list[Line]], str]:
+    def played(self, folder: str) -> tuple[int, dict[str, list[ChartLine]], str]:
         """Number of steps of an episode, its columns by title of a plot, and a note on others."""
         lines = self.files.read_file(f"{folder}/trajectory.jsonl", _MAX_TRAJECTORY).splitlines()
         rows = list(itertools.islice(objects(lines), MAX_STEPS))
@@ -178,7 +178,7 @@ class Detail:
         actions, _ = _series([row.get("action") for row in rows], len(rows), "action")
         if all(type(row.get("action")) is int for row in rows):  # a discrete action holds until the next one
             actions = [line._replace(steps=True) for line in actions]
-        rewards = [Line("reward", list(enumerate(map(_reward, rows))))]
+        rewards = [ChartLine("reward", list(enumerate(map(_reward, rows))))]
         return len(rows), {"Reward": rewards, "Observation": observations, "Action": actions}, note
 
     def _arrays(self, folder: str) -> Any:
@@ -195,7 +195,7 @@ class Detail:
 
     # ---- words and events ----
 
-    def messages(self, before: int | None = None) -> list[Message]:
+    def messages(self, before: int | None = None) -> list[LogMessage]:
         """The last entries of the agent's log, or the last that begin before a place in it; oldest first."""
         lines = self._last_lines("logs/agent.jsonl", before)
         return [each for at, line in lines for each in _messages(at, line)][-MAX_WORDS:]
@@ -261,7 +261,7 @@ def _reward(row: dict[str, object]) -> float:
     return float(reward) if isinstance(reward, int | float) and abs(reward) <= LARGEST else float("nan")
 
 
-def _series(columns: object, n: int, name: str) -> tuple[list[Line], str]:
+def _series(columns: object, n: int, name: str) -> tuple[list[ChartLine], str]:
     """Lines of those values that are numeric with one length; and a note if some are left out."""
     if columns is None:
         return [], ""
@@ -283,7 +283,7 @@ def _series(columns: object, n: int, name: str) -> tuple[list[Line], str]:
     if width > 64:
         return [], f"{name} has {width:,} numbers a step, so it is not drawn."
     lines = [
-        Line(name if width == 1 else f"{name}[{i}]", list(enumerate(values)))
+        ChartLine(name if width == 1 else f"{name}[{i}]", list(enumerate(values)))
         for i, values in enumerate(array[:, :_MAX_SERIES].T.tolist())
     ]
     return lines, f"The first {_MAX_SERIES} of {width} components are drawn." if width > _MAX_SERIES else ""
@@ -309,14 +309,14 @@ _ENDS: Mapping[str, tuple[str, tuple[str, ...]]] = {
 """Title of an entry, and the fields of which the first that is not empty is its text, by the type of a note."""
 
 
-def _messages(at: int, line: bytes) -> Iterator[Message]:
+def _messages(at: int, line: bytes) -> Iterator[LogMessage]:
     told = (entry for value in objects([line]) for part in parts(value) for entry in _told(part))
     for number, (kind, title, text) in enumerate(told):
         if text.strip() or title:
-            yield Message(at=at + number, kind=kind, title=title[:200], text=_cut(text.strip()))
+            yield LogMessage(at=at + number, kind=kind, title=title[:200], text=_cut(text.strip()))
 
 
-def _told(part: Part) -> Iterator[tuple[str, str, str]]:
+def _told(part: LogPart) -> Iterator[tuple[str, str, str]]:
     if part.kind == "call":
         yield "tool", part.name or "tool", _plain(part.value)
     elif part.kind != "note":

@@ -31,7 +31,7 @@ from evopolicy_common.records.summary import Summary
 from evopolicy_common.regular_files import MAX_NAMES, Confined, read_regular
 from evopolicy_results.reading.environments import learn_names
 from evopolicy_results.reading.reader import find_run_dirs
-from evopolicy_results.reading.records import Submit
+from evopolicy_results.reading.records import PastSubmit
 
 T = TypeVar("T")
 
@@ -74,7 +74,7 @@ class RunFacts(msgspec.Struct, frozen=True, kw_only=True):
     wall_s: float = 0.0
     hidden_cases: str = "shared"
     score: float | None = None
-    """Hidden; shown only where `Runs.may_show` permits it."""
+    """Hidden; shown only where `ShownRuns.may_show` permits it."""
     random: float | None = None
     """Uniform random actions on the same hidden cases."""
     finished: bool = False
@@ -105,7 +105,7 @@ class RunFacts(msgspec.Struct, frozen=True, kw_only=True):
         return max(0.0, (time.time() - self.started_at) * (self.budget - self.used) / self.used)
 
 
-class Sweep(msgspec.Struct, frozen=True, kw_only=True):
+class ShownSweep(msgspec.Struct, frozen=True, kw_only=True):
     """One folder that was named, or one sweep below it."""
 
     name: str
@@ -114,8 +114,8 @@ class Sweep(msgspec.Struct, frozen=True, kw_only=True):
     paused: bool = False
 
 
-class Runs(msgspec.Struct, frozen=True, kw_only=True):
-    sweeps: tuple[Sweep, ...] = ()
+class ShownRuns(msgspec.Struct, frozen=True, kw_only=True):
+    sweeps: tuple[ShownSweep, ...] = ()
     by_key: Mapping[str, RunFacts] = {}
     shut: frozenset[str] | None = frozenset()
     """Environments of which a related agent may be alive; None: of all."""
@@ -145,7 +145,7 @@ def key_of(text: str) -> str:
     return hashlib.sha256(text.encode("utf-8", "backslashreplace")).hexdigest()[:16]
 
 
-class Reader:
+class FolderReader:
     """Reads the folders again and again, and only what has changed."""
 
     def __init__(self, roots: Sequence[Path]) -> None:
@@ -153,12 +153,12 @@ class Reader:
         self._records: dict[Path, tuple[tuple[int, int], RunFacts]] = {}
         self._submits: dict[Path, dict[int, Summary]] = {}
 
-    def read_runs(self, cluster: Sequence[RunStatus] | None, *, cluster_is_known: bool) -> Runs:
+    def read_runs(self, cluster: Sequence[RunStatus] | None, *, cluster_is_known: bool) -> ShownRuns:
         """All runs as they are now. `cluster`: its unfinished runs; `cluster_is_known` False: it should be asked and
         does not answer."""
         by_run = {status.run: status for status in cluster or ()}
         by_name = {(status.entry, status.env, status.exp_id): status for status in by_run.values()}
-        sweeps: list[Sweep] = []
+        sweeps: list[ShownSweep] = []
         sweep_folders = _sweep_folders(self.roots)
         for root, index in sweep_folders:
             inner = [other for other, _ in sweep_folders if root in other.parents]
@@ -178,11 +178,11 @@ class Reader:
                     status = by_run.get(entry.run) or by_name.get(name)
                     runs.append(_elsewhere(f"{root}\n{entry.name}", entry, status))
             paused = (root / PAUSED).exists()
-            sweeps.append(Sweep(name=suite, root=root, runs=tuple(runs), paused=paused))
+            sweeps.append(ShownSweep(name=suite, root=root, runs=tuple(runs), paused=paused))
         seen = {run.run for sweep in sweeps for run in sweep.runs}
         others = [each for each in by_run.values() if each.run not in seen]
         if elsewhere := tuple(_elsewhere(each.run, None, each) for each in others):
-            sweeps.append(Sweep(name="elsewhere on the cluster", root=None, runs=elsewhere))
+            sweeps.append(ShownSweep(name="elsewhere on the cluster", root=None, runs=elsewhere))
         by_key = {run.key: run for sweep in sweeps for run in sweep.runs}
         open_here = [run for run in by_key.values() if run.path and run.agent_alive and not run.finished]
         on_cluster = [status for status in by_run.values() if _may_be_alive(status)]
@@ -193,7 +193,7 @@ class Reader:
         while further := {before.get(name, "") for name in origins} - origins:
             origins |= further
         shut = frozenset(alive) if cluster_is_known else None
-        return Runs(sweeps=tuple(sweeps), by_key=by_key, shut=shut, origins=frozenset(origins - {""}))
+        return ShownRuns(sweeps=tuple(sweeps), by_key=by_key, shut=shut, origins=frozenset(origins - {""}))
 
     def run(self, folder: Path, entry: SweepRun | None, by_run: Mapping[str, RunStatus]) -> RunFacts:
         try:
@@ -206,7 +206,7 @@ class Reader:
             known = self._records[folder] = stamp, replace(_finished(folder), stamp=stamp)
         return known[1] if entry is None else replace(known[1], repeat=entry.repeat)
 
-    def submits(self, folder: Path) -> list[Submit]:
+    def submits(self, folder: Path) -> list[PastSubmit]:
         """The submits of a run, in order; each summary is read once."""
         known = self._submits.setdefault(folder, {})
         for one in read_submits(folder, names=MAX_NAMES, size=_MAX_SUMMARY_BYTES):
@@ -216,7 +216,7 @@ class Reader:
         summaries = sorted(known.values(), key=lambda each: each.submit_index)
         consumed = itertools.accumulate(each.n_episodes for each in summaries)
         return [
-            Submit(
+            PastSubmit(
                 index=one.submit_index,
                 status=one.status,
                 n_episodes=one.n_episodes,
@@ -262,7 +262,7 @@ class Reader:
                 del known[path]
 
 
-def _best(submits: Iterable[Submit]) -> float | None:
+def _best(submits: Iterable[PastSubmit]) -> float | None:
     return max((one.mean_return for one in submits if one.mean_return is not None), default=None)
 
 
@@ -282,7 +282,7 @@ def _finished(folder: Path) -> RunFacts:
     learn_names([record])
     outcome, dimensions, tokens = record.outcome, record.experiment_dimensions, record.agent.tokens
     retries = outcome.auxiliary.get("infrastructure_retries")
-    submits = Reader([]).submits(folder)
+    submits = FolderReader([]).submits(folder)
     return RunFacts(
         key=key_of(str(folder)),
         path=folder,

@@ -9,11 +9,11 @@ from pathlib import Path
 
 from evopolicy_common.messages.status import DiskUse, StatusReply, WorkerStatus
 from evopolicy_common.terminal import duration, short
-from evopolicy_coordinator.web.content.cluster import Cluster
+from evopolicy_coordinator.web.content.cluster import ShownCluster
 from evopolicy_coordinator.web.content.remarks import remarks, served_by
 from evopolicy_coordinator.web.content.rendering import PAGE_ROWS, Words, ident, paged, part
-from evopolicy_coordinator.web.content.run_folders import RunFacts, Runs
-from evopolicy_results.html import Notice, View
+from evopolicy_coordinator.web.content.run_folders import RunFacts, ShownRuns
+from evopolicy_results.html import Notice, PageView
 from evopolicy_results.reading.environments import title_of
 
 _NOTICE_LINES = 5
@@ -24,10 +24,10 @@ _UNKNOWN = StatusReply(
 """Before the first answer."""
 
 
-def cluster_view(cluster: Cluster, words: Words, runs: Runs, roots: Sequence[Path]) -> View:
+def cluster_view(cluster: ShownCluster, words: Words, runs: ShownRuns, roots: Sequence[Path]) -> PageView:
     """Workers, queue, and problems."""
     status = cluster.status or _UNKNOWN
-    view = View("worker-rows", "open-rows")
+    view = PageView("worker-rows", "open-rows")
     classes = {worker.fingerprint: worker.versions for worker in status.workers}
     by_run = {run.run: run for run in runs.by_key.values() if run.run}
     names = {run.run: f"{run.entry} on {title_of(run.env)}" for run in status.runs}
@@ -72,7 +72,7 @@ def _cluster_facts(status: StatusReply) -> list[tuple[str, str]]:
     ]
 
 
-def _cluster_notices(cluster: Cluster, status: StatusReply) -> list[Notice]:
+def _cluster_notices(cluster: ShownCluster, status: StatusReply) -> list[Notice]:
     silent = "The coordinator does not answer" + (
         "; this is the last that is known." if cluster.status else "."
     )

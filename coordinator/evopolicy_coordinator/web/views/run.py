@@ -19,13 +19,13 @@ from evopolicy_common.regular_files import NotThereError
 from evopolicy_common.terminal import counted, duration, number, short
 from evopolicy_coordinator.web.content.rendering import Words, ident, part, state_words
 from evopolicy_coordinator.web.content.run_detail import IMAGES, MAX_WORDS, CodeFile, Detail, Happened
-from evopolicy_coordinator.web.content.run_folders import Reader, RunFacts, Runs
+from evopolicy_coordinator.web.content.run_folders import FolderReader, RunFacts, ShownRuns
 from evopolicy_results.behaviour.trace import Trace, diff, trace
 from evopolicy_results.figures.line_chart import chart
-from evopolicy_results.html import Notice, View
+from evopolicy_results.html import Notice, PageView
 from evopolicy_results.html.run_page import run_view
 from evopolicy_results.reading.reader import read_run
-from evopolicy_results.reading.records import Submit
+from evopolicy_results.reading.records import PastSubmit
 from evopolicy_results.studies.palette import looks
 
 MAX_EPISODES = 256
@@ -33,16 +33,16 @@ MAX_EPISODES = 256
 
 def live_run_view(
     run: RunFacts,
-    runs: Runs,
-    reader: Reader,
+    runs: ShownRuns,
+    reader: FolderReader,
     words: Words,
     *,
     retries: Sequence[RetriedJobs] = (),
-) -> View:
+) -> PageView:
     """One run: curve, submits, words, events. `retries`: the jobs of it that the cluster has played again."""
     may_show, path = runs.may_show(run), run.path
     traced = _traced(path, run.stamp) if path is not None and run.finished else None
-    submits: Sequence[Submit] = () if traced is None else traced.run.submits
+    submits: Sequence[PastSubmit] = () if traced is None else traced.run.submits
     if path is not None and traced is None:
         submits = reader.submits(path)
     view = run_view(
@@ -134,7 +134,7 @@ def _one_run_notices(run: RunFacts, may_show: bool) -> list[Notice]:
     return notices
 
 
-def submit_values(run: RunFacts, reader: Reader, index: int) -> dict[str, Any]:
+def submit_values(run: RunFacts, reader: FolderReader, index: int) -> dict[str, Any]:
     """The parts of one submit's page. NotThereError for a submit that is unknown or has no verdict yet."""
     submits = {one.index: one for one in (reader.submits(run.path) if run.path else ())}
     submit = submits.get(index)

@@ -9,10 +9,10 @@ from pathlib import Path
 
 from evopolicy_common.cli.conventions import bytes_text
 from evopolicy_common.terminal import counted, duration, number, short
-from evopolicy_coordinator.web.content.cluster import Cluster
+from evopolicy_coordinator.web.content.cluster import ShownCluster
 from evopolicy_coordinator.web.content.rendering import STATES, Words, ident, paged, part, state_words
-from evopolicy_coordinator.web.content.run_folders import RunFacts, Runs, Sweep
-from evopolicy_results.html import Notice, View
+from evopolicy_coordinator.web.content.run_folders import RunFacts, ShownRuns, ShownSweep
+from evopolicy_results.html import Notice, PageView
 from evopolicy_results.reading.environments import title_of
 from evopolicy_results.studies.palette import Look, looks
 
@@ -21,11 +21,13 @@ MAX_CELLS = 300
 _TROUBLED = ("error", "unreadable", "no_ok_submit", "cancelled", "interrupted")
 
 
-def sweeps_view(runs: Runs, cluster: Cluster | None, words: Words, roots: Sequence[Path]) -> View:
+def sweeps_view(
+    runs: ShownRuns, cluster: ShownCluster | None, words: Words, roots: Sequence[Path]
+) -> PageView:
     """All runs: a matrix for each sweep, and one table."""
     every = [run for sweep in runs.sweeps for run in sweep.runs]
     agents = looks(runs.entries, None)
-    view = View("matrices", "run-rows")
+    view = PageView("matrices", "run-rows")
     cells = MAX_CELLS
     for sweep in runs.sweeps:
         name = ident("sweep", str(sweep.root))
@@ -82,7 +84,7 @@ def _sweep_facts(every: Sequence[RunFacts]) -> list[tuple[str, str]]:
 
 
 def _run_notices(
-    runs: Runs, every: Sequence[RunFacts], cluster: Cluster | None, roots: Sequence[Path]
+    runs: ShownRuns, every: Sequence[RunFacts], cluster: ShownCluster | None, roots: Sequence[Path]
 ) -> list[Notice]:
     notices: list[Notice] = []
     if cluster is not None and cluster.trouble:
@@ -110,7 +112,9 @@ def _run_notices(
     return notices
 
 
-def _matrix(name: str, sweep: Sweep, runs: Runs, agents: Mapping[str, Look], most: int) -> tuple[str, int]:
+def _matrix(
+    name: str, sweep: ShownSweep, runs: ShownRuns, agents: Mapping[str, Look], most: int
+) -> tuple[str, int]:
     cells: dict[tuple[str, str], list[RunFacts]] = {}
     shown = sorted(sweep.runs, key=lambda run: (_order(run)[0], run.repeat))[:most]
     for run in shown:

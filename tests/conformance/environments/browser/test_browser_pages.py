@@ -27,7 +27,7 @@ import pytest
 from evopolicy_worker.environments.browser import page as page_module
 from evopolicy_worker.environments.browser.devtools import BrowserLostError
 from evopolicy_worker.environments.browser.keys import ALT, CONTROL, SHIFT, combined
-from evopolicy_worker.environments.browser.page import CLICK, Address, Button, Page
+from evopolicy_worker.environments.browser.page import CLICK, Button, Page, PageSource
 
 pytestmark = pytest.mark.families
 
@@ -40,10 +40,10 @@ def browser() -> Iterator[Page]:
     page.lose()
 
 
-def address(folder: Path, script: str, *, body: str = "", name: str = "attack.html") -> Address:
+def address(folder: Path, script: str, *, body: str = "", name: str = "attack.html") -> PageSource:
     """A document with this script."""
     (folder / name).write_text(f"<!DOCTYPE html><html><body>{body}<script>{script}</script></body></html>")
-    return Address(root=folder, path=name, width=500, height=320)
+    return PageSource(root=folder, path=name, width=500, height=320)
 
 
 def guarded(browser: Page, folder: Path, script: str = "window.here = 1", *, body: str = "") -> str:

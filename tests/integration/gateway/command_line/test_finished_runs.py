@@ -22,7 +22,7 @@ from evopolicy_common.console import Terminal
 from evopolicy_common.messages.run_settings import RunSettings
 from evopolicy_common.records.policies import checkpoints
 from evopolicy_common.records.run_difference import differences
-from evopolicy_gateway.operator.cluster import Cluster
+from evopolicy_gateway.operator.cluster import ChosenCluster
 from evopolicy_gateway.run import record
 from evopolicy_gateway.run.plan import Plan
 from evopolicy_gateway.run.watch import RunView
@@ -64,7 +64,7 @@ def played(plan: Plan, operator_file: Path) -> tuple[str, str]:
     """State of the run in its command, and the command's output."""
     output = io.StringIO()
     done = asyncio.run(
-        runs.play_plans([plan], Cluster(file=operator_file), 1, Terminal(file=output, width=300))
+        runs.play_plans([plan], ChosenCluster(file=operator_file), 1, Terminal(file=output, width=300))
     )
     return done.index.runs[plan.name].state, output.getvalue()
 

@@ -23,8 +23,8 @@ UNIFIED = next(
 
 
 @pytest.fixture
-def group() -> Iterator[cgroups.Group]:
-    found = cgroups.Group({"cpu": 10_000, "memory": 100_000_000, "pids": 4})
+def group() -> Iterator[cgroups.ControlGroup]:
+    found = cgroups.ControlGroup({"cpu": 10_000, "memory": 100_000_000, "pids": 4})
     yield found
     found.remove()
 
@@ -32,7 +32,7 @@ def group() -> Iterator[cgroups.Group]:
 @pytest.mark.skipif(
     not {*cgroups.CONTROLLERS} <= cgroups.hierarchies().keys(), reason="needs cgroups: make test-root as root"
 )
-def test_a_group_limits_and_counts_what_joins_it(group: cgroups.Group) -> None:
+def test_a_group_limits_and_counts_what_joins_it(group: cgroups.ControlGroup) -> None:
     assert group.held.keys() == {*cgroups.CONTROLLERS}
     busy = "import os\nfor _ in range(8):\n try: os.fork()\n except OSError: pass\nwhile True: pass"
     with subprocess.Popen(ending_with_parent([sys.executable, "-c", busy], joins=group.procs)) as process:
@@ -80,7 +80,7 @@ cgroups.CONTROLLERS = ("{controller}",)
 os.setgroups([]), os.setgid(65534), os.setuid(65534)
 print(cgroups.hierarchies())
 print(cgroups.hierarchies())
-group = cgroups.Group({{}})
+group = cgroups.ControlGroup({{}})
 print(list(group.procs))
 print(os.getpid(), file=sys.stderr)
 if os.fork() == 0:

@@ -18,7 +18,7 @@ import pytest
 from evopolicy_common.errors import ConfigError, StorageError
 from evopolicy_common.records.blobs import BlobStore, digest_of
 from evopolicy_common.records.policies import bundles, trees
-from evopolicy_common.records.policies.trees import Recorder, Tree, TreeFile
+from evopolicy_common.records.policies.trees import Tree, TreeFile, TreeRecorder
 from evopolicy_common.records.secrets import Passed
 
 KEY = "sk-live-4f8a1c9d7e2b6a3f0c5d"
@@ -38,8 +38,8 @@ def run(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def recorded(run: Path, recorder: Recorder | None = None, passed: Passed | None = None) -> Tree:
-    recorder = recorder or Recorder(run / "workspace", run / "trees")
+def recorded(run: Path, recorder: TreeRecorder | None = None, passed: Passed | None = None) -> Tree:
+    recorder = recorder or TreeRecorder(run / "workspace", run / "trees")
     digest = recorder.record("submit_000", bundles.snapshot(run / "workspace" / "system"), passed)
     tree, again = trees.read_tree(run, "submit_000")
     assert again == digest
@@ -62,7 +62,7 @@ def test_a_tree_has_the_agents_files_and_restores_them(run: Path, tmp_path: Path
 
 
 def test_equal_contents_are_stored_once_and_changed_ones_anew(run: Path) -> None:
-    recorder = Recorder(run / "workspace", run / "trees")
+    recorder = TreeRecorder(run / "workspace", run / "trees")
     (run / "workspace" / "copy.md").write_text("gain 0.3")
     recorded(run, recorder)
     assert len(list(BlobStore(run / "trees").digests())) == 2
@@ -73,7 +73,7 @@ def test_equal_contents_are_stored_once_and_changed_ones_anew(run: Path) -> None
 
 
 def test_an_unchanged_file_is_not_read_again(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    recorder = Recorder(run / "workspace", run / "trees")
+    recorder = TreeRecorder(run / "workspace", run / "trees")
     monkeypatch.setattr(trees, "_SETTLED_NS", -(10**10))  # as if it were old
     first = recorded(run, recorder)
     monkeypatch.setattr(trees, "digest_of", lambda data: "0" * 64)
@@ -85,7 +85,7 @@ def test_an_unchanged_file_is_not_read_again(run: Path, monkeypatch: pytest.Monk
 def test_the_policy_is_the_submitted_bundles(run: Path) -> None:
     bundle = bundles.snapshot(run / "workspace" / "system")
     (run / "workspace" / "system" / "policy.py").write_text("changed meanwhile")
-    Recorder(run / "workspace", run / "trees").record("submit_000", bundle, None)
+    TreeRecorder(run / "workspace", run / "trees").record("submit_000", bundle, None)
     tree, _ = trees.read_tree(run, "submit_000")
     assert {file.path: file.blob for file in tree.files}["system/policy.py"] == digest_of(
         b"class Policy: ...\n"
@@ -126,7 +126,7 @@ def test_a_flood_is_bounded_and_keeps_the_policy(run: Path, monkeypatch: pytest.
         (workspace / "flood" / f"{n:03}").write_bytes(bytes(1000) + str(n).encode())
     with (workspace / "sparse").open("wb") as file:
         file.truncate(1 << 40)
-    recorder = Recorder(workspace, run / "trees")
+    recorder = TreeRecorder(workspace, run / "trees")
     for _ in range(40):
         (workspace / "changed").write_bytes(os.urandom(1900))
         tree = recorded(run, recorder)
@@ -196,7 +196,7 @@ def test_the_history_has_feedback_up_to_the_submit_and_no_links(run: Path, tmp_p
 
 
 def test_changes_of_the_workspace_are_named(run: Path) -> None:
-    recorder = Recorder(run / "workspace", run / "trees")
+    recorder = TreeRecorder(run / "workspace", run / "trees")
     (run / "workspace" / "log").write_text("1")
     recorder.record("submit_000", None, None)
     assert trees.changes(run, 0) == "new log, notes.md"

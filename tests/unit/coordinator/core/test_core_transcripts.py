@@ -56,7 +56,7 @@ class Transcript(Rig):
         self.lines.clear()
 
     def _noted(self, what: str, rule: machine.Rule) -> machine.Rule:
-        def noted(state: Any, news: Any, this: step.Step) -> None:
+        def noted(state: Any, news: Any, this: step.CoreStep) -> None:
             about = f" {news}" if isinstance(news, str) else ""  # whom a deadline is about
             name = f"{rule.__module__.removeprefix('evopolicy_coordinator.core.')}.{rule.__name__}"
             self.lines.append(f"{what}{about} → {name}")

@@ -14,13 +14,13 @@ from hypothesis import strategies as st
 
 from evopolicy_common.errors import ConfigError
 from evopolicy_coordinator.pki import certs
-from evopolicy_coordinator.pki.certs import Pair
+from evopolicy_coordinator.pki.certs import KeyPair
 
 NOW = dt.datetime(2031, 5, 6, 7, 8, 9, tzinfo=dt.UTC)
 AUTHORITY = certs.make_authority("lab", NOW)
 
 
-def loaded(pair: Pair) -> x509.Certificate:
+def loaded(pair: KeyPair) -> x509.Certificate:
     return x509.load_pem_x509_certificate(pair.certificate)
 
 

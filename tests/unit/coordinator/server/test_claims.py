@@ -12,17 +12,17 @@ import pytest
 
 from evopolicy_common.errors import RefusedError
 from evopolicy_common.messages.operator import Claim
-from evopolicy_coordinator.server.claims import Claims
+from evopolicy_coordinator.server.claims import ClaimTable
 from evopolicy_coordinator.storage.store import Store
 from evopolicy_coordinator.storage.writer import Writer
 
 
 @contextlib.asynccontextmanager
-async def claims_in(path: Path) -> AsyncIterator[Claims]:
+async def claims_in(path: Path) -> AsyncIterator[ClaimTable]:
     store = Store(path / "store.db")
     writer = Writer(store)
     try:
-        yield Claims(writer)
+        yield ClaimTable(writer)
     finally:
         await writer.close()
         store.close()

@@ -13,7 +13,7 @@ import pytest
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.processes.scratch import scratch_folder
 from evopolicy_common.wire import credentials
-from evopolicy_common.wire.credentials import Ready
+from evopolicy_common.wire.credentials import ReadyCluster
 from evopolicy_coordinator.storage.state_folder import InUseError, StateFolder, reachable, resolve_listen
 
 
@@ -74,7 +74,9 @@ def test_a_local_cluster_is_shared_by_commands_with_its_options_alone(tmp_path: 
     options = {"--data": "/cases", "--hidden-isolation": "related"}
     state = StateFolder.open(tmp_path, local=options)
     assert refused_by(tmp_path).shared(options) is None  # it is starting
-    ready = Ready(cluster="local", endpoints=("tcp/127.0.0.1:7447",), credentials={}, state=str(tmp_path))
+    ready = ReadyCluster(
+        cluster="local", endpoints=("tcp/127.0.0.1:7447",), credentials={}, state=str(tmp_path)
+    )
     state.serving(ready)
     assert refused_by(tmp_path).shared(dict(options)) == ready
     others = {"--hidden-isolation": "off", "env_timeout": "5"}

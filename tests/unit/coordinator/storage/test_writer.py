@@ -16,7 +16,7 @@ from rigs.store_rows import run_row
 from evopolicy_common.errors import StorageError
 from evopolicy_coordinator.core.contract.effects import Effect, Log, Persist
 from evopolicy_coordinator.storage.store import Store
-from evopolicy_coordinator.storage.writer import Outbox, Writer
+from evopolicy_coordinator.storage.writer import EffectQueue, Writer
 
 
 def persist(number: int) -> Persist:
@@ -38,7 +38,7 @@ class World:
         self.out: list[Effect] = []
         self.failures: list[BaseException] = []
         self.durable_when_out: list[set[str]] = []
-        self.outbox = Outbox(self.writer, self._carry_out, self.failures.append)
+        self.outbox = EffectQueue(self.writer, self._carry_out, self.failures.append)
 
     def _carry_out(self, effect: Effect) -> None:
         self.out.append(effect)

@@ -9,7 +9,7 @@ import msgspec
 from invented.web_site import finished_run, open_run, open_status
 
 from evopolicy_common.records.suite_folder import INDEX, Index, SweepRun
-from evopolicy_coordinator.web.content.run_folders import Reader
+from evopolicy_coordinator.web.content.run_folders import FolderReader
 
 
 def test_a_sweep_shows_its_runs_on_all_hosts_once(tmp_path: Path) -> None:
@@ -28,7 +28,9 @@ def test_a_sweep_shows_its_runs_on_all_hosts_once(tmp_path: Path) -> None:
     other = open_status(
         "r-there", exp_id="s-1", repeat=1, best_mean=-70.5, waits_for="a free slot", agent_host="lab2"
     )
-    found = Reader([tmp_path]).read_runs([open_status("r-here", exp_id="s-0"), other], cluster_is_known=True)
+    found = FolderReader([tmp_path]).read_runs(
+        [open_status("r-here", exp_id="s-0"), other], cluster_is_known=True
+    )
     (sweep,) = (sweep for sweep in found.sweeps if sweep.runs)
     assert sweep.name == "s"
     first, second, third, fourth = sorted(sweep.runs, key=lambda run: run.repeat)
@@ -48,7 +50,7 @@ def test_runs_beside_sweeps_are_shown_apart_from_them(tmp_path: Path) -> None:
     open_run(tmp_path / "sweep")
     (tmp_path / "sweep" / "suite.json").write_text('{"suite": "inner"}')
     finished_run(tmp_path / "other")
-    found = Reader([tmp_path]).read_runs(None, cluster_is_known=True)
+    found = FolderReader([tmp_path]).read_runs(None, cluster_is_known=True)
     assert {sweep.name: len(sweep.runs) for sweep in found.sweeps} == {"inner": 1, tmp_path.name: 1}
 
 
@@ -56,7 +58,7 @@ def test_a_damaged_record_is_a_run_with_that_error_and_stops_nothing(tmp_path: P
     folder = finished_run(tmp_path)
     open_run(tmp_path)
     (folder / "run.json").write_text("{")
-    reader = Reader([tmp_path])
+    reader = FolderReader([tmp_path])
     found = reader.read_runs(None, cluster_is_known=True)
     assert sorted(run.state for run in found.by_key.values()) == ["interrupted", "unreadable"]
     assert "not a run record" in next(run.error for run in found.by_key.values() if run.finished)
@@ -68,4 +70,4 @@ def test_a_summary_that_an_agent_forged_is_passed_over(tmp_path: Path) -> None:
         place = folder / "workspace" / "feedback" / name
         place.mkdir()
         (place / "summary.json").write_text(text)
-    assert [one.summary.submit_index for one in Reader([tmp_path]).submits(folder)] == [0]
+    assert [one.summary.submit_index for one in FolderReader([tmp_path]).submits(folder)] == [0]

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 from stages.agent_fakes import FakeGateway, serving
 
-from evopolicy_gateway.agents.client import Client, ProtocolError, Refusal, Verdict
+from evopolicy_gateway.agents.client import ChargedSubmit, Client, GatewayError, RefusedSubmit
 
 BOX = {"type": "Box", "shape": [1], "dtype": "float32", "low": [-1.0], "high": [1.0]}
 
@@ -45,7 +45,7 @@ def a_client(url: str, **options: Any) -> Client:
 def test_submit_is_asked_for_until_its_summary_is_there(tmp_path: Path) -> None:
     with serving(a_gateway(tmp_path)) as gateway:
         verdict = a_client(gateway.url).submit([3, 4])
-        assert isinstance(verdict, Verdict)
+        assert isinstance(verdict, ChargedSubmit)
         assert verdict.name == "submit_000"
         assert verdict.summary["returns"] == [3.0, 4.0]
         assert gateway.n_asked == 2
@@ -56,7 +56,7 @@ def test_a_submit_is_sent_again_until_it_is_taken_once(
     first: tuple[int, dict[str, Any]], tmp_path: Path
 ) -> None:
     with serving(a_gateway(tmp_path, script=[first, first])) as gateway:
-        assert isinstance(a_client(gateway.url).submit([0]), Verdict)
+        assert isinstance(a_client(gateway.url).submit([0]), ChargedSubmit)
         assert len(gateway.submits) == 1
 
 
@@ -65,13 +65,13 @@ def test_a_run_that_takes_no_more_ends_the_asking(tmp_path: Path, status: str) -
     over = (409, {"status": status, "error": {"message": "no more submits are taken"}})
     with serving(a_gateway(tmp_path, script=[over])) as gateway:
         refusal = a_client(gateway.url).submit([0])
-        assert refusal == Refusal(status=status, message="no more submits are taken")
+        assert refusal == RefusedSubmit(status=status, message="no more submits are taken")
 
 
 def test_refused_submit_tells_status_and_message(tmp_path: Path) -> None:
     with serving(a_gateway(tmp_path)) as gateway:
         refusal = a_client(gateway.url).submit(list(range(11)))
-        assert refusal == Refusal(status="budget_invalid", message="11 episodes, 10 left")
+        assert refusal == RefusedSubmit(status="budget_invalid", message="11 episodes, 10 left")
 
 
 def test_task_is_read_as_text(tmp_path: Path) -> None:
@@ -83,7 +83,7 @@ def test_a_gateway_that_stays_away_is_given_up_after_the_timeout() -> None:
     with socket.socket() as unused:
         unused.bind(("127.0.0.1", 0))
         client = a_client(f"http://127.0.0.1:{unused.getsockname()[1]}", timeout_s=5.0)
-        with pytest.raises(ProtocolError, match="did not answer for 5 s"):
+        with pytest.raises(GatewayError, match="did not answer for 5 s"):
             client.info()
 
 

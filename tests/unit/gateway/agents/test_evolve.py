@@ -12,8 +12,8 @@ import pytest
 from stages.agent_fakes import FakeGateway, Play, serving
 
 from evopolicy_gateway.agents import evolve
-from evopolicy_gateway.agents.client import Client, ProtocolError
-from evopolicy_gateway.agents.evolve import Agent, actions, features, observations
+from evopolicy_gateway.agents.client import Client, GatewayError
+from evopolicy_gateway.agents.evolve import EvolveAgent, actions, features, observations
 
 UNIT = {"type": "Box", "shape": [2], "dtype": "float32", "low": [-1.0, -1.0], "high": [1.0, 1.0]}
 CHOICE = {"type": "Discrete", "n": 3}
@@ -50,10 +50,10 @@ def a_run(workspace: Path, budget: int, play: Play = play_point, **options: Any)
     return FakeGateway(workspace=workspace, play=play, budget=budget, **spaces)
 
 
-def agent_of(gateway: FakeGateway, identity: str = "evolve/toy/0") -> Agent:
+def agent_of(gateway: FakeGateway, identity: str = "evolve/toy/0") -> EvolveAgent:
     urls = {f"{name}_url": f"{gateway.url}/{name}" for name in ("info", "task", "submit")}
     client = Client(**urls, sleep=lambda seconds: None, timeout_s=5.0)
-    return Agent(client, gateway.workspace, identity)
+    return EvolveAgent(client, gateway.workspace, identity)
 
 
 def bundle_of(gateway: FakeGateway, index: int) -> dict[str, Any]:
@@ -109,7 +109,7 @@ def test_submits_that_are_not_ok_are_survived(tmp_path: Path, capsys: pytest.Cap
 def test_a_refusal_ends_the_agent_with_its_words(tmp_path: Path) -> None:
     refusal = (400, {"status": "invalid_env_instance", "error": {"message": "no such case"}})
     with serving(a_run(tmp_path, 40, script=[refusal] * 9)) as gateway:
-        with pytest.raises(ProtocolError, match="no such case"):
+        with pytest.raises(GatewayError, match="no such case"):
             agent_of(gateway).run()
         assert not gateway.submits
 

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from evopolicy_gateway.agents.client import ProtocolError, Refusal, Verdict
+from evopolicy_gateway.agents.client import ChargedSubmit, GatewayError, RefusedSubmit
 from evopolicy_gateway.agents.replay import folder_for, policies_in, shares, stage, submit_all
 from evopolicy_gateway.agents.uniform import POLICY
 from evopolicy_gateway.agents.uniform import submit_random as play_uniform
@@ -32,11 +32,13 @@ class FakeClient:
             "max_episodes_per_submit": self.most,
         }
 
-    def submit(self, env_instances: list[int]) -> Verdict | Refusal:
+    def submit(self, env_instances: list[int]) -> ChargedSubmit | RefusedSubmit:
         self.asked.append(env_instances)
         if not env_instances:
-            return Refusal(status="budget_invalid", message="none")
-        return Verdict(name=f"submit_{len(self.asked) - 1:03d}", status="ok", summary={"mean_return": 0.0})
+            return RefusedSubmit(status="budget_invalid", message="none")
+        return ChargedSubmit(
+            name=f"submit_{len(self.asked) - 1:03d}", status="ok", summary={"mean_return": 0.0}
+        )
 
 
 def policy(folder: Path, text: str = "x") -> Path:
@@ -116,7 +118,7 @@ def test_replay_submits_each_policy_with_its_share(tmp_path: Path) -> None:
     assert client.asked == [[0, 1, 2, 0], [0, 1, 2], [0, 1, 2]]
     assert (tmp_path / "system" / "policy.py").read_text() == "c"
     (tmp_path / "empty").mkdir()
-    with pytest.raises(ProtocolError, match="no policy"):
+    with pytest.raises(GatewayError, match="no policy"):
         submit_all(client, tmp_path / "empty", tmp_path)  # type: ignore[arg-type]
 
 

@@ -17,7 +17,7 @@ from stages.provider_api import CACHED, FRESH, OUTPUT, ProviderApi, Said, conver
 from evopolicy_common.errors import ConfigError
 from evopolicy_gateway import harnesses
 from evopolicy_gateway.agents.llm import conversation, shell
-from evopolicy_gateway.agents.llm.conversation import ApiError, Call, Conversation
+from evopolicy_gateway.agents.llm.conversation import ApiError, Conversation, ToolCall
 from evopolicy_gateway.harnesses.interface.agent_config import AgentConfig, ApiName, ApiTable
 from evopolicy_gateway.relay.usage import Prices
 
@@ -149,7 +149,7 @@ async def test_providers_words_for_a_conversation_that_is_too_long_are_known(tex
 def test_shortening_goes_on_until_two_outputs_are_left() -> None:
     known = Conversation(conversation_settings("http://127.0.0.1:1"), "")
     for n in range(12):
-        known.answer([Call(id=str(n))], [f"output {n}"])
+        known.answer([ToolCall(id=str(n))], [f"output {n}"])
     kept = []
     while known.shorten():
         kept.append(known.dumped().count(b"output "))

@@ -22,8 +22,8 @@ from stages.provider_api import (
     conversation_settings,
 )
 
-from evopolicy_gateway.agents.llm.agent import Events, Session, play_turn
-from evopolicy_gateway.agents.llm.conversation import ApiError, Conversation, Reply
+from evopolicy_gateway.agents.llm.agent import EventWriter, Session, play_turn
+from evopolicy_gateway.agents.llm.conversation import ApiError, Conversation, ModelReply
 from evopolicy_gateway.harnesses.interface.agent_config import PROVIDERS, ApiName, ProviderName
 
 pytestmark = pytest.mark.slow
@@ -43,7 +43,7 @@ SPENT = {
 }
 
 
-async def conversed(server: ProviderApi, api: str, n: int, **more: Any) -> list[Reply]:
+async def conversed(server: ProviderApi, api: str, n: int, **more: Any) -> list[ModelReply]:
     """The replies of a conversation that is begun anew from what was kept before each request."""
     settings = conversation_settings(server.base_url, api, **more)
     replies, kept, outputs = [], b"", 0
@@ -64,7 +64,7 @@ def fault(message: str, **more: Any) -> Document:
     return {"error": {"message": message} | more}
 
 
-def said(replies: list[Reply]) -> list[tuple[str, tuple[str, ...]]]:
+def said(replies: list[ModelReply]) -> list[tuple[str, tuple[str, ...]]]:
     assert not any(call.fault for reply in replies for call in reply.calls)
     return [(reply.text, tuple(call.command for call in reply.calls)) for reply in replies]
 
@@ -345,7 +345,7 @@ async def turn(
     with ProviderApi(api, script) as server:
         settings = conversation_settings(server.base_url, api, variable="KEY", context_tokens=10**6)
         session = Session(tmp_path / "s.json")
-        status = await play_turn(Conversation(settings, "key"), "Go on.", session, Events(out, "s"))
+        status = await play_turn(Conversation(settings, "key"), "Go on.", session, EventWriter(out, "s"))
     return status, [json.loads(line) for line in out.getvalue().splitlines()], server
 
 

@@ -22,11 +22,11 @@ from evopolicy_gateway.harnesses.coding_agents.cli_agent import CliAgent
 from evopolicy_gateway.harnesses.interface.agent_config import AcpTable, AgentConfig, Cli
 from evopolicy_gateway.inputs import declared
 from evopolicy_gateway.inputs.declared import McpServer, read_inputs
-from evopolicy_gateway.inputs.kept import MCP_FILE, Kept, keep
+from evopolicy_gateway.inputs.kept import MCP_FILE, KeptInputs, keep
 from evopolicy_gateway.run import plan
 
 
-def kept(folder: Path, place: Path) -> Kept:
+def kept(folder: Path, place: Path) -> KeptInputs:
     skills, servers = declare(folder)
     expected = [each.recorded for each in read_inputs(skills, servers, folder)]
     return keep(skills, servers, folder, place, expected)

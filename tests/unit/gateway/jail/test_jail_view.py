@@ -14,21 +14,21 @@ import pytest
 from program_runs import put_program, run_program
 
 from evopolicy_gateway.jail.installs import hidden_below, needs_of
-from evopolicy_gateway.jail.view import View
+from evopolicy_gateway.jail.view import JailView
 
 
 def arguments(tmp_path: Path, **fields: object) -> list[str]:
     return view(tmp_path, **fields).arguments()
 
 
-def view(tmp_path: Path, command: tuple[str, ...] = (), **fields: object) -> View:
+def view(tmp_path: Path, command: tuple[str, ...] = (), **fields: object) -> JailView:
     workspace = tmp_path / "runs" / "w"
     (workspace / "feedback").mkdir(parents=True)
     (workspace / "AGENTS.md").touch()
     usual: dict[str, object] = {"workspace": workspace, "private": tmp_path / "private"}
     usual |= {"home": "/home/somebody", "needs": needs_of(command, None), "read": (), "write": ()}
     usual |= {"hidden": (tmp_path / "runs",), "open_network": False}
-    return View(**(usual | fields))  # type: ignore[arg-type]
+    return JailView(**(usual | fields))  # type: ignore[arg-type]
 
 
 def triples(words: list[str], option: str) -> list[tuple[str, str]]:

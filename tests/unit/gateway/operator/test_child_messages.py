@@ -10,12 +10,12 @@ import pytest
 from program_runs import run_python
 
 from evopolicy_gateway.processes import child_messages
-from evopolicy_gateway.processes.child_messages import AnyEvent, CloseRun
+from evopolicy_gateway.processes.child_messages import AnyEvent, CloseGateway
 
 LONG: dict[str, Any] = {"x" * 1000: {"input": list(range(400_000))}}
 
 
-def filled(kind: type[child_messages.Event]) -> child_messages.Event:
+def filled(kind: type[child_messages.FromChild]) -> child_messages.FromChild:
     """An event of that kind with as much in every field as an agent could have put there."""
     required: dict[str, Any] = {}
     for field in msgspec.structs.fields(kind):
@@ -32,15 +32,15 @@ def filled(kind: type[child_messages.Event]) -> child_messages.Event:
 
 
 @pytest.mark.parametrize("kind", get_args(AnyEvent))
-def test_no_event_is_longer_than_its_reader_takes(kind: type[child_messages.Event]) -> None:
+def test_no_event_is_longer_than_its_reader_takes(kind: type[child_messages.FromChild]) -> None:
     line = child_messages.line(filled(kind))
     assert len(line) <= child_messages.MAX_LINE_BYTES
     assert isinstance(child_messages.event_of(line), kind)
 
 
 def test_an_agents_facts_are_passed_on_unless_too_large() -> None:
-    assert b'"turns":3' in child_messages.line(CloseRun(reason="agent_stopped", agent={"turns": 3}))
-    assert b'"agent":{"left_out":' in child_messages.line(CloseRun(reason="agent_stopped", agent=LONG))
+    assert b'"turns":3' in child_messages.line(CloseGateway(reason="agent_stopped", agent={"turns": 3}))
+    assert b'"agent":{"left_out":' in child_messages.line(CloseGateway(reason="agent_stopped", agent=LONG))
 
 
 OPERATOR = """

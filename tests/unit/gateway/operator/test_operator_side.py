@@ -21,10 +21,10 @@ from evopolicy_common.records.run_record import RejectedSubmit, decode_run_recor
 from evopolicy_gateway.cli.play import _unjailed
 from evopolicy_gateway.declared import declared, set_values
 from evopolicy_gateway.jail.settings import JailSettings
-from evopolicy_gateway.operator.cluster import Cluster
+from evopolicy_gateway.operator.cluster import ChosenCluster
 from evopolicy_gateway.operator.trials import policy_bundle
 from evopolicy_gateway.processes import child_messages
-from evopolicy_gateway.processes.child_messages import Progress
+from evopolicy_gateway.processes.child_messages import TrainProgress
 from evopolicy_gateway.run import record
 from evopolicy_gateway.run.run_options import (
     ClusterOptions,
@@ -229,13 +229,13 @@ def test_profile_published_makes_every_published_choice_and_takes_no_other() -> 
     with pytest.raises(ConfigError, match="profile published has n_heldout = 32, but 256 was given"):
         RunOptions(agent="evolve", profile="published", heldout=256).settings("toy/line", "t")
     with pytest.raises(ConfigError, match="give --data FOLDER"):
-        Cluster(local=ClusterOptions()).check_cases([published])
-    Cluster(local=ClusterOptions()).check_cases([own])
-    Cluster(local=ClusterOptions(data=Path("data"))).check_cases([published])
+        ChosenCluster(local=ClusterOptions()).check_cases([published])
+    ChosenCluster(local=ClusterOptions()).check_cases([own])
+    ChosenCluster(local=ClusterOptions(data=Path("data"))).check_cases([published])
 
 
 def test_control_lines_come_back_as_they_were_and_nothing_else_does() -> None:
-    progress = Progress(episode_budget=8, remaining_budget=3, n_submits=1, last_mean=1.5)
+    progress = TrainProgress(episode_budget=8, remaining_budget=3, n_submits=1, last_mean=1.5)
     assert child_messages.event_of(child_messages.line(progress)) == progress
     for junk in (b"", b"{}", b'{"event": "other"}', b"plain text"):
         with pytest.raises(ProtocolError):

@@ -15,7 +15,7 @@ from evopolicy_common.console import Terminal
 from evopolicy_common.messages.gateway import FREE_SLOT
 from evopolicy_common.messages.operator import RunProgress
 from evopolicy_common.terminal import harmless
-from evopolicy_gateway.processes.child_messages import AgentDoing, Progress
+from evopolicy_gateway.processes.child_messages import AgentDoing, TrainProgress
 from evopolicy_gateway.run.watch import RunView, first_line
 from evopolicy_gateway.suite.suite_view import SuiteView
 
@@ -60,7 +60,7 @@ def test_a_runs_wait_is_told_once() -> None:
     assert out.getvalue().count(f"waiting for {missing}") == 2
     sweep = SuiteView(["run"], 1, console)
     sweep.rows["run"].state = "running"
-    progress = Progress(
+    progress = TrainProgress(
         episode_budget=8, remaining_budget=4, n_submits=1, submit_id="submit_000", n_episodes=4
     )
     sweep.progress("run", msgspec.structs.replace(progress, waits_for=FREE_SLOT))

@@ -24,7 +24,7 @@ from evopolicy_gateway.processes.child_messages import StartRelay
 from evopolicy_gateway.relay import service
 from evopolicy_gateway.relay.apis import Upstream
 from evopolicy_gateway.relay.limits import Limits
-from evopolicy_gateway.relay.service import Order
+from evopolicy_gateway.relay.service import RelaySetup
 from evopolicy_gateway.relay.usage import Prices
 
 PRICES = Prices(input=1.0, output=50.0, tiers={"priority": 2.0})
@@ -189,7 +189,7 @@ def test_hostile_documents_leave_the_relays_memory_bounded(tmp_path: Path) -> No
     """Four bodies of 32 MB took 1.9 GB."""
     sock = bound("127.0.0.1", 0)
     sock.listen(64)
-    order = Order(
+    order = RelaySetup(
         upstream=Upstream(protocol="openai", base_url="http://127.0.0.1:1/v1", key=KEY),
         token=TOKEN,
         ledger=str(tmp_path / "ledger.jsonl"),

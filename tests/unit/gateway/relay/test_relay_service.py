@@ -22,7 +22,7 @@ from stages.relay_stage import GEMINI, KEY, NOON, PATHS, TOKEN, asked, relay
 from evopolicy_gateway.relay import service
 from evopolicy_gateway.relay.__main__ import tell
 from evopolicy_gateway.relay.apis import Protocol
-from evopolicy_gateway.relay.limits import Limits, Request, Used, read_ledger
+from evopolicy_gateway.relay.limits import Limits, LoggedRequest, Used, read_ledger
 from evopolicy_gateway.relay.provider import Provider, Sent
 from evopolicy_gateway.relay.usage import Prices, Usage
 
@@ -333,7 +333,7 @@ def test_a_line_a_minute_has_requests_tokens_and_cost() -> None:
         slept.append(seconds)
         for _ in range(next(requests)):
             usage = Usage(input_noncached=1000, output=100)
-            used.count_request(Request(at=NOON, api="responses", asked="m", status=200, usage=usage))
+            used.count_request(LoggedRequest(at=NOON, api="responses", asked="m", status=200, usage=usage))
 
     with pytest.raises(RuntimeError, match="StopIteration"):
         asyncio.run(tell(used, Prices(input=1000.0, output=10000.0), said.append, sleep))

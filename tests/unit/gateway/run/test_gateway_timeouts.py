@@ -23,7 +23,7 @@ from starlette.responses import PlainTextResponse
 
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.wire import http as server
-from evopolicy_gateway.agents.client import Client, ProtocolError
+from evopolicy_gateway.agents.client import Client, GatewayError
 from evopolicy_gateway.harnesses import command
 from evopolicy_gateway.harnesses.coding_agents import cli_agent, turn
 from evopolicy_gateway.harnesses.interface import base
@@ -51,7 +51,7 @@ def mute_server() -> Iterator[str]:
 def test_an_agent_gives_up_on_a_gateway_that_says_nothing() -> None:
     with mute_server() as url:
         client = Client(info_url=url, task_url=url, submit_url=url, answer_s=SOON_S, timeout_s=SOON_S)
-        with pytest.raises(ProtocolError, match="did not answer"):
+        with pytest.raises(GatewayError, match="did not answer"):
             client.info()
 
 

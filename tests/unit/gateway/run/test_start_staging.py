@@ -31,7 +31,9 @@ def parent(tmp_path: Path) -> RunFolder:
     folder.system.mkdir()
     (folder.system / "policy.py").write_text("submitted")
     (folder.workspace / "notes.md").write_text("notes")
-    trees.Recorder(folder.workspace, folder.trees).record("submit_000", bundles.snapshot(folder.system), None)
+    trees.TreeRecorder(folder.workspace, folder.trees).record(
+        "submit_000", bundles.snapshot(folder.system), None
+    )
     (folder.system / "policy.py").write_text("selected by hidden cases")
     (folder.checkpoints / "submit_000").mkdir(parents=True)
     (folder.checkpoints / "submit_000" / "_meta.json").write_text("hidden")
@@ -62,7 +64,7 @@ def test_a_start_gets_the_recorded_workspace_and_no_hidden_result(parent: RunFol
     }
     assert (workspace / "system" / "policy.py").read_text() == "submitted"
     assert "`history/`" in (workspace / "AGENTS.md").read_text()
-    recorder = trees.Recorder(workspace, started.folder.trees, started=started.folder.start.exists())
+    recorder = trees.TreeRecorder(workspace, started.folder.trees, started=started.folder.start.exists())
     unchanged = recorder.record("submit_000", bundles.snapshot(started.folder.system), None)
     assert unchanged == started.settings.start.tree
 

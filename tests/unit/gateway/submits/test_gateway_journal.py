@@ -15,14 +15,14 @@ from evopolicy_common.messages.gateway import Submit, SubmitAccepted
 from evopolicy_common.records.open_run import (
     AnyLine,
     Rejected,
-    Requested,
     Settled,
+    SubmitRequested,
 )
 from evopolicy_common.records.run_record import RejectedSubmit
 from evopolicy_gateway.run_folder.journal import Journal
 from evopolicy_gateway.run_folder.layout import RunFolder
 
-REQUESTED = Requested(
+REQUESTED = SubmitRequested(
     submit=Submit(key="k", env_instances=(1, 2), bundle="b" * 64), client_key=None, body_digest="d"
 )
 ENTRIES: list[AnyLine] = [

@@ -19,14 +19,14 @@ from evopolicy_common.records.blobs import digest_of
 from evopolicy_common.records.open_run import (
     AnyLine,
     Died,
-    Refused,
     Rejected,
-    Requested,
     Settled,
+    SubmitRefused,
+    SubmitRequested,
 )
 from evopolicy_common.refusals import Refusal
 from evopolicy_gateway.submits import tickets
-from evopolicy_gateway.submits.snapshots import Snapshot
+from evopolicy_gateway.submits.snapshots import SystemSnapshot
 from evopolicy_gateway.submits.tickets import (
     ConflictError,
     Effect,
@@ -57,7 +57,7 @@ class World:
         self.profile = profile
         self.journal: list[AnyLine] = []
         self.accepted: dict[str, SubmitAccepted] = {}
-        self.sent: dict[str, Requested] = {}
+        self.sent: dict[str, SubmitRequested] = {}
         self.heard: list[RunState] = []
         """The coordinator's states, oldest first."""
         self.n_asked = 0
@@ -135,7 +135,9 @@ class World:
             return machine.failed(KeyError("a bug"))
         if isinstance(task, TakeSnapshot):
             assert ticket.request not in self.journal
-            return machine.snapshotted(Snapshot(digest=f"bundle-{ticket.request.submit.key}", error=None))
+            return machine.snapshotted(
+                SystemSnapshot(digest=f"bundle-{ticket.request.submit.key}", error=None)
+            )
         key = ticket.request.submit.key
         assert ticket.request in self.journal
         assert self.sent.setdefault(key, ticket.request) == ticket.request
@@ -168,7 +170,7 @@ class World:
         assert all(ticket.accepted for ticket in machine.tickets if ticket is not open_ticket)
         assert (self.effect is None) == (open_ticket is None)
         assert all((kind is ConflictError) == (before is not None) for kind, before in self.refusals)
-        for kinds in (Requested, Settled | Refused):
+        for kinds in (SubmitRequested, Settled | SubmitRefused):
             keys = [getattr(one, "submit", one).key for one in self.journal if isinstance(one, kinds)]
             assert len(keys) == len(set(keys))
         indices = [one.submit_index for one in self.journal if isinstance(one, SubmitAccepted)]

@@ -17,7 +17,7 @@ from evopolicy_results.leaderboard.write import write_site
 from evopolicy_results.notebook import rows, study, tables_of
 from evopolicy_results.publish import card as cards
 from evopolicy_results.publish import descriptions
-from evopolicy_results.publish.findings import Checked
+from evopolicy_results.publish.findings import Findings
 from evopolicy_results.reading.reader import read_run
 from evopolicy_results.scoring.scores import Cell, RunReturns, Scale
 from evopolicy_results.statistics.aggregates import aggregates
@@ -119,7 +119,7 @@ def test_a_report_names_equal_repeats_and_has_no_interval_over_runs(tmp_path: Pa
 
 def test_a_leaderboard_names_equal_repeats(tmp_path: Path) -> None:
     runs = list(map(read_run, played(tmp_path / "runs", (1.0, 1.0))))
-    lab = LabBundle(file="x.evp", sha256="", lab="Lab", checked=Checked(signer="ab" * 32), runs=runs)
+    lab = LabBundle(file="x.evp", sha256="", lab="Lab", checked=Findings(signer="ab" * 32), runs=runs)
     assert f"cases; {BOTH}" in write_site([lab], tmp_path / "site", title="Site").read_text()
 
 
@@ -140,7 +140,7 @@ def test_a_card_names_equal_repeats(tmp_path: Path, gains: tuple[float, ...], ov
         submit = played_submit(bundle=bundle, mean_return=-200.0, val_mean=-180.0)
         played_run = {"run": f"r-{number}", "heldout_returns": record.outcome.heldout_returns}
         result = finished(**played_run, best_submit_index=0, submits=(submit,)).result
-        sources.append(cards.Source(f"runs/{number:04d}", record, result))
+        sources.append(cards.CardSource(f"runs/{number:04d}", record, result))
     card = cards.make(sources, [], signer="", software="")
     assert card.results[0].over == over
     assert f"| {over} |" in descriptions.markdown(card)

@@ -17,7 +17,13 @@ from evopolicy_common.errors import SlotDiedError, WorkerError
 from evopolicy_worker.environments.browser.page import Page
 from evopolicy_worker.environments.families.foreign import ForeignFamily
 from evopolicy_worker.environments.interface import calls
-from evopolicy_worker.environments.interface.calls import USUAL, Call, Guard, Limits, hung
+from evopolicy_worker.environments.interface.calls import (
+    USUAL,
+    EnvironmentLimits,
+    LimitGuard,
+    RunningCall,
+    hung,
+)
 from evopolicy_worker.slot_protocol.endings import AGAIN
 from evopolicy_worker.slots import slot as slot_module
 from evopolicy_worker.slots.slot import Slot
@@ -43,7 +49,7 @@ def slots(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Slots]:
     found.close()
 
 
-def slot_of(slots: Slots, name: str, limits: Limits = USUAL, **more: Any) -> Slot:
+def slot_of(slots: Slots, name: str, limits: EnvironmentLimits = USUAL, **more: Any) -> Slot:
     entry = Entry(id=f"acme/{name}", gymnasium_id=f"acme_envs:{name}-v0", **more)
     return Slot(None, "bwrap", slots.folder / f"of-{name}", definitions=(entry,), limits=limits)
 
@@ -142,7 +148,7 @@ def test_an_environment_that_breaks_its_description_is_refused(
     # After the trial, steps are timed in episodes of other seeds.
     kwargs = {"how": how, "seeds_from": 2 if later else 0}
     with (
-        slots.running(slot_of(slots, "Bad", Limits(call_s=8.0), kwargs=kwargs)) as slot,
+        slots.running(slot_of(slots, "Bad", EnvironmentLimits(call_s=8.0), kwargs=kwargs)) as slot,
         pytest.raises((WorkerError, SlotDiedError), match=why),
     ):
         slots.run(slot.describe(["acme/Bad"]))
@@ -198,9 +204,9 @@ def test_what_prevents_an_episode_is_reported_by_name_and_is_nobodys_result(
     monkeypatch.setattr(slot_module, "_CHECK_S", 0.5)
     monkeypatch.setattr(slot_module, "SILENT_S", 16.0)
     # Long enough for calls that return, also on a busy machine.
-    limits, again = Limits(memory_bytes=320 << 20) if how == "leak" else USUAL, {}
+    limits, again = EnvironmentLimits(memory_bytes=320 << 20) if how == "leak" else USUAL, {}
     if how.startswith(("hang", "hold")):
-        limits, again = Limits(call_s=8.0), {"environment_faults": AGAIN}
+        limits, again = EnvironmentLimits(call_s=8.0), {"environment_faults": AGAIN}
     fuel = {"reward_components": {"fuel": "spent"}}
     with slots.running(slot_of(slots, "Bad", limits, kwargs={"how": how}, **fuel)) as slot:
         # Also where the policy's actions come first, and random ones play the episode again.
@@ -219,7 +225,7 @@ def test_an_environment_that_hangs_on_actions_gives_no_second_throw(
     the slot, and the next attempt plays them; in the fourth one the hang is its failure."""
     monkeypatch.setattr(slot_module, "_CHECK_S", 0.5)
     monkeypatch.setattr(slot_module, "SILENT_S", 16.0)
-    slot = slot_of(slots, "Bad", Limits(call_s=8.0), kwargs={"how": f"{how} when pushed"})
+    slot = slot_of(slots, "Bad", EnvironmentLimits(call_s=8.0), kwargs={"how": f"{how} when pushed"})
     bundle = slots.bundle(LUCKY)
     job = make_job(env="acme/Bad", record="actions")
     stands: list[list[float]] = []
@@ -242,7 +248,9 @@ def test_an_environment_that_hangs_on_actions_gives_no_second_throw(
 
 
 def test_a_close_that_hangs_ends_the_process_at_the_next_episode(slots: Slots) -> None:
-    with slots.running(slot_of(slots, "Bad", Limits(call_s=8.0), kwargs={"how": "hang in close"})) as slot:
+    with slots.running(
+        slot_of(slots, "Bad", EnvironmentLimits(call_s=8.0), kwargs={"how": "hang in close"})
+    ) as slot:
         assert slots.play_all(PUSHES, slot=slot, env="acme/Bad")[0].length == 8
         with pytest.raises(WorkerError, match="environment acme/Bad, close: it has not returned for 8 s"):
             slots.play_all(PUSHES, slot=slot, env="acme/Bad")
@@ -268,9 +276,9 @@ def test_forks_of_an_environment_play_no_part(slots: Slots, how: str) -> None:
 
 
 def test_memory_is_looked_at_from_outside_the_call(monkeypatch: pytest.MonkeyPatch) -> None:
-    guard = Guard(Limits(memory_bytes=64 << 20))
+    guard = LimitGuard(EnvironmentLimits(memory_bytes=64 << 20))
     monkeypatch.setattr(calls, "resident_bytes", lambda: 65 << 20)
-    monkeypatch.setattr(calls, "current", Call())
+    monkeypatch.setattr(calls, "current", RunningCall())
     calls.current.begin("my/env", "reset")
     assert (
         guard.check(1000.0)
@@ -280,8 +288,8 @@ def test_memory_is_looked_at_from_outside_the_call(monkeypatch: pytest.MonkeyPat
 
 
 def test_only_a_calls_running_time_counts(monkeypatch: pytest.MonkeyPatch) -> None:
-    guard = Guard(Limits(call_s=5.0))
-    monkeypatch.setattr(calls, "current", Call())
+    guard = LimitGuard(EnvironmentLimits(call_s=5.0))
+    monkeypatch.setattr(calls, "current", RunningCall())
     call = calls.current
     call.begin("my/env", "reset")
     assert [guard.check(now) for now in (0.0, 100.0, 200.0, 300.0)] == [""] * 4

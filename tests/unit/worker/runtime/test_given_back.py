@@ -203,7 +203,7 @@ def test_a_failure_by_a_limit_is_reported_as_one(slots: Slots) -> None:
 def test_the_file_of_an_episode_holds_actions_of_any_form_and_length(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    log, episode = begun.Log(tmp_path), begun.Begun([(3, 3)])
+    log, episode = begun.ActionLog(tmp_path), begun.RunningEpisode([(3, 3)])
     odd = [np.arange(3, dtype=np.int8), {"a": (np.float32(0.5), "x")}, "\ud800", 2**70]
     values = [*odd, *[[0.1] * 999] * 99]
     log.begins("job", 2, episode)
@@ -224,7 +224,7 @@ def test_the_file_of_an_episode_holds_actions_of_any_form_and_length(
         raise OSError(errno.ENOSPC, "no space left")
 
     monkeypatch.setattr(os, "posix_fallocate", no_room)
-    episode = begun.Begun()
+    episode = begun.RunningEpisode()
     log.begins("job", 0, episode)
     for number in range(600_000):
         episode.add_action(number, number)

@@ -27,12 +27,12 @@ from evopolicy_common.messages.worker import JobResult, ReportResults
 from evopolicy_common.records.episodes.trajectory import Recorder
 from evopolicy_common.wire import codec
 from evopolicy_worker import environments
-from evopolicy_worker.environments.families.toy import Line
+from evopolicy_worker.environments.families.toy import MassOnLine
 from evopolicy_worker.environments.interface.actions import compile_actions
 from evopolicy_worker.episodes import frames
 from evopolicy_worker.episodes.loop import JobPlayer, _blob
 from evopolicy_worker.episodes.monitor import Monitor
-from evopolicy_worker.episodes.policies import Progress
+from evopolicy_worker.episodes.policies import RunningJob
 from evopolicy_worker.episodes.policy_process import PolicyProcess
 from evopolicy_worker.sandbox import jail
 from evopolicy_worker.sandbox.inside import policy_server as shim
@@ -236,7 +236,7 @@ def test_no_forged_frame_costs_more_than_its_own_episode(slots: Slots, scope: st
     assert slot._process.pid == pid
 
 
-class Fragile(Line):
+class Fragile(MassOnLine):
     """Breaks when it is pushed to the right with all strength."""
 
     how = "raise"
@@ -276,7 +276,7 @@ def play(player: JobPlayer, slots: Slots, source: str, n: int = 1, **options: An
     job = make_job(tier="none", n=n, **options)
     outcomes: list[EpisodeOutcome] = []
     bundle = bundle_files(slots.bundle(source))
-    last = player.play_job(job, bundle, Progress(), lambda frame: outcomes.extend(finished(frame)))
+    last = player.play_job(job, bundle, RunningJob(), lambda frame: outcomes.extend(finished(frame)))
     outcomes.extend(finished(last))
     return outcomes
 

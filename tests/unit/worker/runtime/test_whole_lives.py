@@ -11,10 +11,10 @@ import pytest
 from slots import HONEST, STUCK, Slots, begun, make_job, misbehaving, pid_of
 
 from evopolicy_common.errors import SlotDiedError
-from evopolicy_worker.environments.families.toy import Line
+from evopolicy_worker.environments.families.toy import MassOnLine
 from evopolicy_worker.episodes import loop
 from evopolicy_worker.episodes.monitor import Monitor
-from evopolicy_worker.episodes.policies import Progress
+from evopolicy_worker.episodes.policies import RunningJob
 from evopolicy_worker.sandbox import jail
 from evopolicy_worker.sandbox.inside import policy_server
 from evopolicy_worker.sandbox.zygote import Zygote
@@ -26,13 +26,13 @@ def test_a_slots_whole_life(slots: Slots, monkeypatch: pytest.MonkeyPatch) -> No
     lines: list[str] = []
     send, hear = Slot._send, Slot._reply
 
-    async def sent(slot: Slot, message: messages.Message) -> None:
+    async def sent(slot: Slot, message: messages.SlotMessage) -> None:
         lines.append(f"> {type(message).__name__}")
         await send(slot, message)
 
     async def heard(slot: Slot) -> messages.Reply:
         reply = await hear(slot)
-        if not isinstance(reply, messages.Progress):
+        if not isinstance(reply, messages.JobProgress):
             lines.append(f"< {type(reply).__name__}")
         return reply
 
@@ -71,7 +71,7 @@ def test_an_episodes_whole_life(
 ) -> None:
     """Three episodes: an honest one, one whose policy fails, and one whose environment breaks down on an action."""
     lines: list[str] = []
-    begin, source, step = loop._Episode._begin, loop._Episode._source, Line.step
+    begin, source, step = loop._Episode._begin, loop._Episode._source, MassOnLine.step
 
     def begins(episode: loop._Episode) -> Any:
         lines.append("begin")
@@ -81,7 +81,7 @@ def test_an_episodes_whole_life(
         lines.append("random" if policy is None else "asked")
         return source(episode, policy, recorded)
 
-    def stepped(environment: Line, action: Any) -> Any:
+    def stepped(environment: MassOnLine, action: Any) -> Any:
         if float(action[0]) == 1.0:
             lines.append("breaks")
             raise RuntimeError("unknown element")
@@ -89,7 +89,7 @@ def test_an_episodes_whole_life(
 
     monkeypatch.setattr(loop._Episode, "_begin", begins)
     monkeypatch.setattr(loop._Episode, "_source", chosen)
-    monkeypatch.setattr(Line, "step", stepped)
+    monkeypatch.setattr(MassOnLine, "step", stepped)
     plan = jail.plan("none", tmp_path, ("numpy",))
     zygote = Zygote(plan, tmp_path)
 
@@ -103,7 +103,7 @@ def test_an_episodes_whole_life(
     player = loop.JobPlayer(zygote, plan, monitor, tmp_path)
     try:
         bundle = bundle_files(slots.bundle(policy))
-        told(player.play_job(make_job(tier="none", n=3), bundle, Progress(), told))
+        told(player.play_job(make_job(tier="none", n=3), bundle, RunningJob(), told))
     finally:
         zygote.close()
     assert " ".join(lines) == (

@@ -22,7 +22,7 @@ from evopolicy_worker.episodes import policy_process, video
 from evopolicy_worker.episodes.monitor import Monitor
 from evopolicy_worker.episodes.policy_process import PolicyProcess
 from evopolicy_worker.sandbox import jail, zygote
-from evopolicy_worker.sandbox.zygote import Child, Zygote
+from evopolicy_worker.sandbox.zygote import ForkedPolicy, Zygote
 from evopolicy_worker.slot_protocol import slot_messages as messages
 from evopolicy_worker.slots import slot
 
@@ -38,7 +38,7 @@ def found(tmp_path: Path) -> Iterator[Zygote]:
 
 def test_a_zygote_that_does_not_start_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(zygote, "START_TIMEOUT_S", SOON_S)
-    mute = jail.Jail(command=("sleep", "1000"), config={}, home=None, user=None)
+    mute = jail.PolicyJail(command=("sleep", "1000"), config={}, home=None, user=None)
     with pytest.raises(SandboxError, match="does not start: timed out"):
         Zygote(mute, tmp_path)
 
@@ -62,7 +62,7 @@ def test_a_policys_process_that_survives_being_killed_is_reported(
 ) -> None:
     monkeypatch.setattr(zygote, "DEATH_TIMEOUT_S", SOON_S)
     child = found.spawn()
-    monkeypatch.setattr(Child, "kill", lambda self: None)
+    monkeypatch.setattr(ForkedPolicy, "kill", lambda self: None)
     found.bury_later(child)
     with pytest.raises(SandboxError, match="does not end"):
         found.bury()
@@ -81,7 +81,7 @@ def test_a_child_that_does_not_seal_itself_is_killed(
     description = environments.describe("toy/line")
     meta = {"obs_space": description.obs_space, "action_space": description.action_space}
     with pytest.raises(SandboxError, match="could not seal itself"):
-        policy.seal(messages.Files([], b""), bytes(16), meta, "arrays")
+        policy.seal(messages.BundleFiles([], b""), bytes(16), meta, "arrays")
     assert policy.dead
     policy.end()
 

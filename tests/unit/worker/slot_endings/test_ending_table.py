@@ -39,7 +39,7 @@ EXAMPLES: dict[str, tuple[Ending, str | None]] = {
 
 
 @pytest.mark.parametrize("row", TABLE, ids=lambda row: row.name)
-def test_each_row_of_the_table_gives_its_verdict(row: endings.Row) -> None:
+def test_each_row_of_the_table_gives_its_verdict(row: endings.EndingRule) -> None:
     ending, expected = EXAMPLES[row.name]
     assert row.fits(ending)
     assert endings.verdict(ending) == expected

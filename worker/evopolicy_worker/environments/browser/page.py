@@ -62,7 +62,7 @@ CLICK = ((PRESS, 1), (RELEASE, 1))
 DOUBLE_CLICK = (*CLICK, (PRESS, 2), (RELEASE, 2))
 
 
-class Address(msgspec.Struct, frozen=True):
+class PageSource(msgspec.Struct, frozen=True):
     """Files and initial script of a page."""
 
     root: Path
@@ -84,7 +84,7 @@ class Page:
     """The one page of this process's browser. `opened` is what it shows."""
 
     def __init__(self) -> None:
-        self.opened: Address | None = None
+        self.opened: PageSource | None = None
         self._browser: Chromium | None = None
         self._context = self._session = self._script = ""
         self._loaded = False
@@ -109,7 +109,7 @@ class Page:
             self._browser.devtools.send("Target.setDiscoverTargets", wanted=False, discover=True)
         return self._browser
 
-    def open(self, address: Address, seed: str) -> None:
+    def open(self, address: PageSource, seed: str) -> None:
         """Loads it anew. `seed`: of the random numbers that its scripts draw while it loads. Raises BrowserLostError
         when it does not load."""
         if self.opened != address:
@@ -402,7 +402,7 @@ _CODE = ("SCRIPT", "STYLE")
 _BITS: dict[Button, int] = {"left": 1, "right": 2, "middle": 4}
 
 
-def _first(address: Address) -> list[tuple[str, dict[str, Any]]]:
+def _first(address: PageSource) -> list[tuple[str, dict[str, Any]]]:
     """Commands that prepare a target for a page."""
     size = {"width": address.width, "height": address.height, "deviceScaleFactor": 1, "mobile": False}
     commands: list[tuple[str, dict[str, Any]]] = [

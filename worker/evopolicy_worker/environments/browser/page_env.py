@@ -25,7 +25,7 @@ import numpy as np
 from evopolicy_common.errors import ConfigError
 from evopolicy_worker.environments.browser import miniwob_pages
 from evopolicy_worker.environments.browser.devtools import BrowserLostError
-from evopolicy_worker.environments.browser.page import Address, Page, shared
+from evopolicy_worker.environments.browser.page import Page, PageSource, shared
 from evopolicy_worker.environments.interface.base import Frame
 
 STEP_MS = 200
@@ -81,7 +81,7 @@ class PageEnv(gymnasium.Env[Any, Any]):
         self._fresh = load == "each" or clock == "wall"
         self._limit_ms, self._screenshot = episode_ms, screenshot
         self._size = FLIGHT if page.startswith("flight.") else USUAL
-        self._address = Address(
+        self._address = PageSource(
             root=miniwob_pages.folder() / "html",
             path=miniwob_pages.document(page),
             width=self._size[0],

@@ -63,7 +63,7 @@ class _Toy(Environment):
         pass
 
 
-class Line(_Toy):
+class MassOnLine(_Toy):
     """A mass on a line is pushed to a target that moves slowly back and forth.
 
     State: position x, velocity v, target g = centre + 0.3 sin(phase + 0.1 t), t in steps. One step with push a:

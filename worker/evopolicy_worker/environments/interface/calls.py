@@ -1,7 +1,7 @@
 """The current call into an environment, so that a hang or an error can name it; and the end of forks that return.
 
 The thread that plays sets `current`, which takes a few dozen nanoseconds a step. The monitor's thread reads it
-(`Guard`).
+(`LimitGuard`).
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ _SHOWN_LINES, _LONGEST_LINE = 3, 240
 """Of a traceback: its last lines, and characters of each."""
 
 
-class Call:
+class RunningCall:
     """The running call. `what` is empty while none runs."""
 
     def __init__(self) -> None:
@@ -71,10 +71,10 @@ class Call:
         return f"environment {self.env}, {what}" if what else f"environment {self.env}"
 
 
-current = Call()
+current = RunningCall()
 
 
-class Limits(msgspec.Struct, frozen=True, kw_only=True):
+class EnvironmentLimits(msgspec.Struct, frozen=True, kw_only=True):
     """Resources of the slot that an environment may use. Exceeding a limit is never the policy's failure."""
 
     call_s: float = 300.0
@@ -83,13 +83,13 @@ class Limits(msgspec.Struct, frozen=True, kw_only=True):
     """Most resident memory of the environment's process, bytes."""
 
 
-USUAL = Limits()
+USUAL = EnvironmentLimits()
 
 
-class Guard:
+class LimitGuard:
     """Checks from another thread whether the environment keeps its limits."""
 
-    def __init__(self, limits: Limits) -> None:
+    def __init__(self, limits: EnvironmentLimits) -> None:
         self._limits = limits
         self._call: tuple[str, Kind, int] = ("", "", 0)
         self._spent_s = self._checked = self._weighed = 0.0
@@ -196,7 +196,7 @@ def _not_shown(error: BaseException, text: str) -> str:
     return ""
 
 
-def raised(error: BaseException, text: str, limits: Limits) -> str:
+def raised(error: BaseException, text: str, limits: EnvironmentLimits) -> str:
     """Which call raised the error, with `text` of it and the remedy; empty for an error that is not the
     environment's."""
     if not current.what or isinstance(error, SandboxError | SlotDiedError):
