@@ -229,7 +229,7 @@ class GatewayClient:
 
     async def state(self) -> gateway.RunState:
         message = gateway.StateRequest(run=self.run, token=self.token)
-        return (await self.ask.until_answered("state", message, gateway.StateReply)).state
+        return await self.ask.until_answered("state", message, gateway.RunState)
 
     async def submit(self, bundle: Bundle, ids: tuple[int, ...], key: str) -> gateway.SubmitAccepted:
         while True:

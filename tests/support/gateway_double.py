@@ -197,9 +197,9 @@ class Double:
         elif isinstance(message, CloseRun) and isinstance(answer, gateway.RunClosed):
             self.closed = message
         if self.held_s is not None:
-            if isinstance(answer, gateway.ResultsPage):
+            if isinstance(answer, gateway.ResultsPage | RunState):
                 return codec.encode(msgspec.structs.replace(answer, held_s=self.held_s))
-            if isinstance(answer, RunOpened | gateway.StateReply):
+            if isinstance(answer, RunOpened):
                 state = msgspec.structs.replace(answer.state, held_s=self.held_s)
                 return codec.encode(msgspec.structs.replace(answer, state=state))
         return payload

@@ -89,7 +89,7 @@ class CoordinatorClient:
         question = self._signed(messages.StateRequest())
         try:
             async with asyncio.timeout(STATE_TIMEOUT_S):
-                return (await self._requests.once("state", question, messages.StateReply)).state
+                return await self._requests.once("state", question, messages.RunState)
         except (TransportError, TimeoutError):
             return None
         except RefusedError as error:

@@ -111,8 +111,8 @@ FREE_SLOT = "a free slot"
 """A value of `waits_for` that is normal for most submits and no cause for concern."""
 
 
-class RunState(msgspec.Struct, frozen=True, kw_only=True):
-    """The changing part of a run, as its gateway may know it."""
+class RunState(Message, frozen=True, kw_only=True, tag="run_state"):
+    """The changing part of a run, as its gateway may know it; the reply to `StateRequest`."""
 
     remaining_budget: Int
     n_submits: Int
@@ -157,12 +157,6 @@ class RunOpened(Message, Conditions, frozen=True, kw_only=True, tag="run_opened"
 
 class StateRequest(FromGateway, frozen=True, kw_only=True, tag="state"):
     """Requests the run's state; answered at once."""
-
-
-class StateReply(Message, frozen=True, kw_only=True, tag="state_reply"):
-    """The reply to `StateRequest`."""
-
-    state: RunState
 
 
 class Submit(FromGateway, frozen=True, kw_only=True, tag="submit"):
@@ -267,5 +261,5 @@ GatewayRequest = (
     OpenRun | RequestPermit | StateRequest | Submit | ResultsRequest | CloseRun | BlobPut | BlobGet
 )
 GatewayReply = (
-    RunOpened | Permit | StateReply | SubmitAccepted | ResultsPage | RunClosed | BlobAck | BlobChunk | Refused
+    RunOpened | Permit | RunState | SubmitAccepted | ResultsPage | RunClosed | BlobAck | BlobChunk | Refused
 )

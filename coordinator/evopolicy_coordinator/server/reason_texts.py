@@ -13,7 +13,7 @@ from pathlib import Path
 import msgspec
 
 from evopolicy_common.catalogue import installs
-from evopolicy_common.messages.gateway import FREE_SLOT, Permit, RunOpened, StateReply
+from evopolicy_common.messages.gateway import FREE_SLOT, Permit, RunOpened, RunState
 from evopolicy_common.messages.operator import RunProgress
 from evopolicy_common.messages.worker import Message, Refused
 from evopolicy_coordinator.core.contract.effects import Refuse, Reply
@@ -107,10 +107,10 @@ def message(effect: Reply | Refuse, state: Path | None = None) -> Message:
     if effect.waits_for is None:
         return reply
     text = reason_text(effect.waits_for)
-    if isinstance(reply, RunOpened | StateReply):
+    if isinstance(reply, RunOpened):
         return msgspec.structs.replace(reply, state=msgspec.structs.replace(reply.state, waits_for=text))
     if isinstance(reply, RunProgress):
         why = env_failure(effect.waits_for)
         return msgspec.structs.replace(reply, waits_for=operator_words(effect.waits_for), env_failure=why)
-    assert isinstance(reply, Permit)
+    assert isinstance(reply, Permit | RunState)
     return msgspec.structs.replace(reply, waits_for=text)

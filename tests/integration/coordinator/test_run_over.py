@@ -67,7 +67,7 @@ async def refusals(client: GatewayClient) -> dict[str, Refusal]:
     late = bundle_of("# late")
     asked = {
         "open": client.ask.once("open", gateway.OpenRun(**own), gateway.RunOpened),
-        "state": client.ask.once("state", gateway.StateRequest(**own), gateway.StateReply),
+        "state": client.ask.once("state", gateway.StateRequest(**own), gateway.RunState),
         "upload": client.ask.upload(client.run, client.token, late.digest, late.packed),
         "submit": client.submit_digest(bundle_of("# first").digest, (0,), "late"),
         "results": client.results(0),

@@ -137,10 +137,10 @@ def state_requested(state: State, event: events.Requested[gateway.StateRequest],
     """Send a gateway the state of its run, also after it is finished."""
     last = state.finished.get(event.message.run)
     if last is not None:
-        step.reply(event.request, gateway.StateReply(state=last))
+        step.reply(event.request, last)
         return
     current, waits_for = run_state(state, requests.live(state, event.message.run), step.now)
-    step.reply(event.request, gateway.StateReply(state=current), waits_for)
+    step.reply(event.request, current, waits_for)
 
 
 def last_state(row: RunStateRow) -> gateway.RunState:

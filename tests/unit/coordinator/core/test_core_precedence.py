@@ -124,7 +124,7 @@ def test_submits_that_wait_for_hidden_cases_say_so(rig: Rig) -> None:
     session = beside(rig, slots=1, agent="remote")
     hidden = until_hidden(rig, session)
     keep_alive(rig, session, 10.0, hidden)
-    state = rig.ask(gateway.StateRequest, run="r1").state
+    state = rig.ask(gateway.StateRequest, run="r1")
     assert state.waits_for == "hidden cases of another run to be scored"
     assert 7.0 <= state.open_held_s <= 11.0
     assert state.held_s == state.open_held_s
@@ -138,7 +138,7 @@ def test_submits_that_wait_for_hidden_cases_say_so(rig: Rig) -> None:
     assert held_s >= 7.0
     rig.load()
     rig.register(slots=1)
-    assert rig.ask(gateway.StateRequest, run="r1").state.held_s == held_s
+    assert rig.ask(gateway.StateRequest, run="r1").held_s == held_s
 
 
 def test_the_time_a_submit_is_held_counts_against_no_limit(rig: Rig) -> None:

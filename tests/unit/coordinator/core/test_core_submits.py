@@ -35,7 +35,7 @@ def test_rejected_request_costs_no_budget(ids: tuple[int, ...], status: str) -> 
     answer = rig.submit(*ids)
     assert isinstance(answer, Refused)
     assert answer.status == status
-    state = rig.ask(gateway.StateRequest, run="r1").state
+    state = rig.ask(gateway.StateRequest, run="r1")
     assert (state.remaining_budget, state.n_submits) == (16, 0)
     assert not [row for row in rig.rows.values() if isinstance(row, SubmitRow)]
 
@@ -225,5 +225,5 @@ def test_a_cancelled_run_refunds_its_open_submit_and_answers_who_waits() -> None
     assert (done.n_episodes, done.remaining_budget) == (0, 16)
     assert rig.beat(session, first).cancelled == (first.lease_id,)
     assert rig.submit(0, bundle=BUNDLE, key="k9").status == "run_cancelled"
-    state = rig.ask(gateway.StateRequest, run="r1").state
+    state = rig.ask(gateway.StateRequest, run="r1")
     assert (state.is_finalized, state.cancelled, state.remaining_budget) == (True, True, 16)

@@ -73,7 +73,7 @@ def test_a_refusal_is_answered_with_its_status_and_words() -> None:
 
 def test_a_runs_state_names_its_open_submits_wait() -> None:
     state = gateway.RunState(remaining_budget=1, n_submits=1, is_finalized=False, n_done=2)
-    text = message(Reply(request=1, message=gateway.StateReply(state=state), waits_for=because("scoring")))
-    assert isinstance(text, gateway.StateReply)
-    assert text.state.waits_for == "hidden cases of another run to be scored"
-    assert text.state.n_done == 2
+    text = message(Reply(request=1, message=state, waits_for=because("scoring")))
+    assert isinstance(text, gateway.RunState)
+    assert text.waits_for == "hidden cases of another run to be scored"
+    assert text.n_done == 2

@@ -56,7 +56,7 @@ async def test_what_was_answered_is_there_after_a_restart(tmp_path: Path) -> Non
         assert (await world.answer(world.submit(kept[0], "key"))).remaining_budget == 98
     async with started(tmp_path) as world:
         assert await world.create() == kept[0]
-        assert (await world.answer(world.state(kept[0]))).state.remaining_budget == 98
+        assert (await world.answer(world.state(kept[0]))).remaining_budget == 98
 
 
 async def test_an_unwritten_request_did_not_happen_and_may_be_repeated(tmp_path: Path) -> None:
@@ -334,7 +334,7 @@ async def test_a_core_that_fails_now_and_then_is_loaded_each_time(
             while answer is None:
                 answer = await world.answer(world.state(created))
                 await asyncio.sleep(0.01)
-            assert isinstance(answer, gateway.StateReply)
+            assert isinstance(answer, gateway.RunState)
 
 
 async def test_a_row_that_the_store_refuses_ends_the_service(
@@ -382,7 +382,7 @@ async def test_a_request_for_unreadable_data_is_refused_and_others_served(tmp_pa
         refused = await world.answer(Requested(keys.gateway_key("c", created.run, "results"), message))
         assert refused.status == "damaged"
         assert str(tmp_path) not in refused.message
-        assert isinstance(await world.answer(world.state(created)), gateway.StateReply)
+        assert isinstance(await world.answer(world.state(created)), gateway.RunState)
 
 
 async def test_the_process_ends_when_its_service_cannot_go_on(tmp_path: Path) -> None:
@@ -426,7 +426,7 @@ async def test_an_answer_that_cannot_be_made_holds_up_no_other(
         real = service.answer_bytes
 
         def broken(message: Any) -> bytes:
-            if isinstance(message, gateway.StateReply):
+            if isinstance(message, gateway.RunState):
                 raise ValueError("cannot be made")
             return real(message)
 
