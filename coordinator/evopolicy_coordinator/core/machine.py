@@ -190,7 +190,7 @@ def _news(
 
 
 NEWS: dict[tuple[type, str], tuple[Rule, ...]] = {
-    **_news(step.ResultsPersisted, "", results.take_results),
+    **_news(step.ResultReported, "", results.take_result),
     **_news(step.EpisodesDone, "train", runs.played, submits.progressed),
     **_news(step.EpisodesDone, "validation heldout random", runs.played, finalisation.progressed),
     **_news(step.EpisodesDone, "evaluation", evaluations.progressed),

@@ -30,7 +30,7 @@ from evopolicy_coordinator.core.tables.model import Flow, JobGroup, JobState, La
 # The table in `machine` distinguishes news by type, and by `kind` where a type has several.
 
 
-class ResultsPersisted(NamedTuple):
+class ResultReported(NamedTuple):
     """A worker reported the result of one lease."""
 
     worker: Worker
@@ -104,7 +104,7 @@ class AgentOverdue(NamedTuple):
 
 
 News = (
-    ResultsPersisted
+    ResultReported
     | EpisodesDone
     | JobRetried
     | EnvironmentFailed

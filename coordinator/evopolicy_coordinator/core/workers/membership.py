@@ -24,7 +24,7 @@ from evopolicy_coordinator.core.leasing import fleet, leases, pins
 from evopolicy_coordinator.core.leasing.jobs import JobFailure
 from evopolicy_coordinator.core.tables.model import Profile, Worker
 from evopolicy_coordinator.core.tables.state import State
-from evopolicy_coordinator.core.tables.step import CoreStep, ResultsPersisted
+from evopolicy_coordinator.core.tables.step import CoreStep, ResultReported
 from evopolicy_coordinator.core.workers import scheduler
 
 
@@ -98,7 +98,7 @@ def results_reported(state: State, event: events.Requested[wire.ReportResults], 
     """Take results, and answer once they are durable."""
     worker = worker_of(state, event, step)
     for result in event.message.results:
-        step.tell(ResultsPersisted(worker, result))
+        step.tell(ResultReported(worker, result))
     step.reply_last(event.request, wire.ResultsReported(n=len(event.message.results)))
 
 

@@ -31,8 +31,8 @@ from evopolicy_coordinator.core.tables.step import (
     CoreStep,
     EnvironmentFailed,
     EpisodesDone,
+    ResultReported,
     ResultsDiffered,
-    ResultsPersisted,
 )
 
 MAX_OUTCOME_BYTES = 2 << 20
@@ -41,7 +41,7 @@ one episode, whatever its size, so a run with a larger outcome could never tell 
 MAX_LENGTH = 2**31 - 1
 
 
-def take_results(state: State, news: ResultsPersisted, step: CoreStep) -> None:
+def take_result(state: State, news: ResultReported, step: CoreStep) -> None:
     worker, result = news.worker, news.result
     job = state.jobs.get(result.job_id)
     lease = worker.leases.get(result.lease_id)
