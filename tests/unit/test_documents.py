@@ -118,6 +118,12 @@ def test_make_has_the_targets_that_documents_name() -> None:
         assert set(re.findall(r"`make ([a-z-]+)", text_of(document))) <= targets, document
 
 
+@pytest.mark.parametrize("walk", ["One submit", "One hidden evaluation", "One report"])
+def test_a_walk_of_the_architecture_leads_through_at_most_25_files(walk: str) -> None:
+    text = text_of("ARCHITECTURE.md").partition(f"\n## {walk}\n")[2].partition("\n## ")[0]
+    assert 0 < len(set(re.findall(r"\]\(([^)]+)\)", text))) <= 25
+
+
 def test_the_keys_that_the_architecture_lists_are_those_that_are_answered() -> None:
     listed = re.findall(r"`(?:work|gw/<run>)/\{([^}]+)\}`", text_of("ARCHITECTURE.md"))
     assert len(listed) == 2
