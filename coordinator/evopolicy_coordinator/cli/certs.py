@@ -181,7 +181,7 @@ def _own_hosts() -> list[str]:
         hosts.append(str(probe.getsockname()[0]))
     for name in (socket.getfqdn(), socket.gethostname()):
         with contextlib.suppress(ConfigError):
-            certs.check_hosts([name])
+            certs.general_name(name)
             hosts.append(name)
     return hosts
 

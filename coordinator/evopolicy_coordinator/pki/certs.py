@@ -97,7 +97,7 @@ def issue(
         )
     )
     if hosts:
-        names = x509.SubjectAlternativeName([_general_name(host) for host in hosts])
+        names = x509.SubjectAlternativeName([general_name(host) for host in hosts])
         builder = builder.add_extension(names, critical=False)
     return _pair(builder.sign(signer, hashes.SHA256()), key)
 
@@ -115,13 +115,8 @@ def describe(certificate: bytes) -> CertFields:
     return CertFields(serial=f"{parsed.serial_number:x}", expires=parsed.not_valid_after_utc, hosts=hosts)
 
 
-def check_hosts(hosts: Sequence[str]) -> None:
-    """Raises ConfigError that names the first entry that is neither a DNS name nor an address."""
-    for host in hosts:
-        _general_name(host)
-
-
-def _general_name(host: str) -> x509.GeneralName:
+def general_name(host: str) -> x509.GeneralName:
+    """Raises ConfigError for what is neither a DNS name nor an address."""
     try:
         return x509.IPAddress(ipaddress.ip_address(host.strip("[]")))
     except ValueError:

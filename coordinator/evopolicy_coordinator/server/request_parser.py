@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import secrets
 from collections.abc import Callable
-from typing import Any, NamedTuple, TypeVar, get_args
+from typing import Any, NamedTuple, get_args
 
 import msgspec
 from msgspec.structs import replace
@@ -40,7 +40,6 @@ _DECODERS: dict[str, Any] = {
 }
 """By the first part of a key after the cluster's name."""
 
-P = TypeVar("P", gateway.ResultsRequest, operator.EvaluationPoll)
 _NO_REASON = "an override of a run's fingerprint class needs a reason"
 
 
@@ -200,7 +199,7 @@ class RequestParser:
     def _check_poll(self, m: gateway.ResultsRequest) -> gateway.ResultsRequest:
         index = m.submit_index
         require(0 <= index <= checks.MAX_COUNT, Refusal.UNKNOWN_SUBMIT, f"this run has no submit {index}")
-        return _bounded_cursor(m)
+        return replace(m, cursor=checks.finite_cursor(m.cursor))
 
 
 class RequestKind(NamedTuple):
@@ -214,10 +213,6 @@ class RequestKind(NamedTuple):
     """Whether it would create something: a run, a submit, an evaluation."""
     waits: bool = False
     """Whether it has `wait_s`, which is bounded."""
-
-
-def _bounded_cursor(m: P) -> P:
-    return replace(m, cursor=checks.finite_cursor(m.cursor))
 
 
 REQUESTS: dict[type[Message], RequestKind] = {
@@ -241,7 +236,9 @@ REQUESTS: dict[type[Message], RequestKind] = {
     operator.Rescore: RequestKind(creates=True),
     operator.Disclose: RequestKind(creates=True),
     operator.WaitRun: RequestKind(waits=True),
-    operator.EvaluationPoll: RequestKind(check=lambda _, m: _bounded_cursor(m), waits=True),
+    operator.EvaluationPoll: RequestKind(
+        check=lambda _, m: replace(m, cursor=checks.finite_cursor(m.cursor)), waits=True
+    ),
     operator.RepinRun: RequestKind(
         check=lambda _, m: require(bool(m.reason.strip()), Refusal.BAD_MESSAGE, _NO_REASON)
     ),

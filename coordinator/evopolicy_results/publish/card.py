@@ -26,7 +26,6 @@ from evopolicy_common.records.aggregates import mean
 from evopolicy_common.records.run_record import RunRecord, RunSummary
 from evopolicy_common.records.summary import utc_text
 from evopolicy_common.records.words import CANARY
-from evopolicy_common.statistics.intervals import Estimate
 from evopolicy_results.publish import contents
 from evopolicy_results.scoring import scores
 from evopolicy_results.statistics.pairs import cell_mean
@@ -149,8 +148,10 @@ def make(
     cells: dict[tuple[str, str, str], list[CardSource]] = {}
     by_entry: dict[str, list[CardSource]] = {}
     for each in sources:
-        cells.setdefault((each.record.env, each.record.agent.entry, _start(each.record)), []).append(each)
-        by_entry.setdefault(each.record.agent.entry, []).append(each)
+        record = each.record
+        start = "" if record.start is None else record.start.text
+        cells.setdefault((record.env, record.agent.entry, start), []).append(each)
+        by_entry.setdefault(record.agent.entry, []).append(each)
     conditions = _conditions(records)
     scores = [[each.record.outcome.score for each in cell] for cell in cells.values()]
     return Card(
@@ -174,10 +175,6 @@ def make(
     )
 
 
-def _start(record: RunRecord) -> str:
-    return "" if record.start is None else record.start.text
-
-
 def _cell(env: str, entry: str, start: str, sources: Sequence[CardSource]) -> CardCell:
     """With the interval of reports (`docs/explanation/statistics.md`)."""
     runs = []
@@ -189,7 +186,9 @@ def _cell(env: str, entry: str, start: str, sources: Sequence[CardSource]) -> Ca
         policy = next((each.bundle for each in selected), None) or ""
         runs.append(scores.RunReturns(score=score, returns=returns, case_set=cases, policy=policy))
     cell = scores.Cell(entry=entry, env=env, runs=tuple(runs))
-    estimate = cell_mean(cell)
+    estimate, over = cell_mean(cell), "a run has no score"
+    if estimate is not None:
+        over = "; ".join(filter(None, (estimate.reason or estimate.over, cell.repeated)))
     outcomes = [each.record.outcome for each in sources]
     measured = [each.score for each in outcomes if each.score is not None]
     random = [each.random_score for each in outcomes if each.random_score is not None]
@@ -201,15 +200,9 @@ def _cell(env: str, entry: str, start: str, sources: Sequence[CardSource]) -> Ca
         mean=mean(measured) if estimate else None,
         low=estimate.low if estimate else None,
         high=estimate.high if estimate else None,
-        over=_over(estimate, cell.repeated),
+        over=over,
         random=mean(random) if random else None,
     )
-
-
-def _over(estimate: Estimate | None, repeated: str) -> str:
-    if estimate is None:
-        return "a run has no score"
-    return "; ".join(filter(None, (estimate.reason or estimate.over, repeated)))
 
 
 def _agent(entry: str, sources: Sequence[CardSource]) -> AgentCost:

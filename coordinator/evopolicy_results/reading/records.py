@@ -81,10 +81,6 @@ class PastRun(msgspec.Struct, frozen=True, kw_only=True):
     """The re-score that the record's held-out results were replaced by; None for the run's own."""
 
     @property
-    def simulation_allowed(self) -> bool:
-        return self.record.experiment_dimensions.simulation == "allowed"
-
-    @property
     def entry(self) -> str:
         """Leaderboard entry: the model, or the operator's name for the agent."""
         return self.record.agent.entry or self.record.model

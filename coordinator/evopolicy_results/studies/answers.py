@@ -122,7 +122,11 @@ def _of_returns(suite: SuiteStudy) -> Leader:
     first = agents[0]
     own = suite.statistics.means.get((first, env))
     lead = f"mean return {number(column[first]) if own is None else valued(own)}"
-    pairs = {other: pair for pair in suite.statistics.pairs for other in _other(pair, first)}
+    pairs = {
+        pair.second if pair.first == first else pair.first: pair
+        for pair in suite.statistics.pairs
+        if first in (pair.first, pair.second)
+    }
     gap = None if len(agents) < 2 or agents[1] not in pairs else _turned(pairs[agents[1]], first)
     if gap is not None:
         lead += f", {valued(gap)} above {agents[1]}"
@@ -130,7 +134,11 @@ def _of_returns(suite: SuiteStudy) -> Leader:
         lead += f", before {agents[1]} with {number(column[agents[1]])}"
     if random is not None:
         lead += f"; random actions return {number(random)}"
-    better = {other for other, pair in pairs.items() if _winner(pair) == first}
+    better = {
+        other
+        for other, pair in pairs.items()
+        if pair.verdict == ("first" if pair.first == first else "second")
+    }
     tied = [entry for entry in agents[1:] if entry not in better]
     few = [entry for entry in tied if entry in pairs and pairs[entry].verdict == "too few runs"]
     tied = [entry for entry in tied if entry not in few]
@@ -139,15 +147,6 @@ def _of_returns(suite: SuiteStudy) -> Leader:
         needed = max(pairs[entry].n_needed or 0 for entry in few)
         texts.append(f"Too few runs for a verdict on {_names(few)}; about {needed} of each would do.")
     return Leader(suite=suite.title, entry=first, lead=f"{lead}.", apart=" ".join(texts))
-
-
-def _other(pair: Pair, entry: str) -> list[str]:
-    return [pair.second] if pair.first == entry else [pair.first] if pair.second == entry else []
-
-
-def _winner(pair: Pair) -> str:
-    """Empty where no agent is told apart from the other."""
-    return {"first": pair.first, "second": pair.second}.get(pair.verdict, "")
 
 
 def _turned(pair: Pair, entry: str) -> Estimate | None:
@@ -189,7 +188,7 @@ _REMARKS: tuple[tuple[Callable[[PastRun], bool], str], ...] = (
      "played an environment whose episodes are not confirmed to repeat."),
     (lambda run: not run.record.versions.data_secret,
      "played public splits, of case files or a public seed: agents and models may know the hidden cases."),
-    (lambda run: run.simulation_allowed, "let their agent simulate."),
+    (lambda run: run.record.experiment_dimensions.simulation == "allowed", "let their agent simulate."),
     (lambda run: run.record.line.jail == "none", "had no jail around their agent, or that of a run they start from."),
     (lambda run: run.record.hidden_isolation == "unknown",
      "do not record whether hidden episodes and agents shared a kernel."),

@@ -136,11 +136,6 @@ def _is_module(path: str) -> bool:
     return beside and _is_shown(path, folder)
 
 
-def _is_file(entry: os.DirEntry[str], package: str) -> bool:
-    """Whether an entry that is not hidden is a file, or a link that is shown as one."""
-    return entry.is_file(follow_symlinks=False) or (entry.is_symlink() and _is_shown(entry.path, package))
-
-
 def _entries(folder: str) -> list[os.DirEntry[str]]:
     """The entries of a folder that may be shown; none of one that cannot be read."""
     try:
@@ -163,7 +158,7 @@ def _content(folder: str, package: str) -> tuple[list[str], bool]:
             inner, entirely = _content(entry.path, package)
             shown += [entry.path] if entirely else inner
             whole = whole and entirely
-        elif _is_file(entry, package):
+        elif entry.is_file(follow_symlinks=False) or (entry.is_symlink() and _is_shown(entry.path, package)):
             shown.append(entry.path)
         elif not entry.is_symlink():
             whole = False

@@ -274,18 +274,13 @@ def _first(flow: Flow, priority: int, worker: Worker, now: float, *, sole: bool)
     return best
 
 
-def head(lane: Lane, priority: int) -> JobState | None:
-    """The lane's first job at one priority, for any worker; None when none waits."""
-    flow = lane.top(priority) if lane.n_ready[priority] else None
-    return None if flow is None else _next(flow, priority)
-
-
 def next_bundle(lane: Lane) -> tuple[str | None, str] | None:
     """Bundle and environment of the lane's next job; None when none waits."""
     for priority in range(N_PRIORITIES):
-        job = head(lane, priority)
-        if job is not None:
-            return job.group.template.bundle, job.group.template.env
+        flow = lane.top(priority) if lane.n_ready[priority] else None
+        if flow is not None:
+            template = _next(flow, priority).group.template
+            return template.bundle, template.env
     return None
 
 
