@@ -9,7 +9,7 @@ import subprocess
 import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import IO, Annotated, Any
+from typing import IO, Annotated
 
 import msgspec
 import numpy as np
@@ -177,7 +177,7 @@ def _job(description: EnvironmentDescription, tier: Tier) -> Job:
     )
 
 
-def literal(value: Any) -> Any:
+def literal(value: object) -> object:
     """An action as a Python literal."""
     if isinstance(value, np.ndarray | np.generic):
         return value.tolist()

@@ -147,12 +147,12 @@ class Database(abc.ABC):
         for statement in self.guards:
             self.execute(statement)
 
-    def batch(self) -> contextlib.AbstractContextManager[Any]:
+    def batch(self) -> contextlib.AbstractContextManager[object]:
         """Statements inside need not wait for each other's result."""
         return contextlib.nullcontext()
 
     @abc.abstractmethod
-    def execute(self, statement: str, args: Iterable[Any] = ()) -> Any:
+    def execute(self, statement: str, args: Iterable[object] = ()) -> Any:
         """Returns a DB-API cursor."""
 
     @abc.abstractmethod
@@ -160,7 +160,7 @@ class Database(abc.ABC):
         """Executes the statement with each row."""
 
     @abc.abstractmethod
-    def stream(self, statement: str, args: Iterable[Any] = ()) -> Iterator[tuple[Any, ...]]:
+    def stream(self, statement: str, args: Iterable[object] = ()) -> Iterator[tuple[Any, ...]]:
         """Rows of a SELECT, of which few are in memory at once. The connection does nothing else meanwhile."""
 
     @abc.abstractmethod
@@ -288,7 +288,7 @@ class Postgres(Database):
         with self.errors():
             pass
 
-    def execute(self, statement: str, args: Iterable[Any] = ()) -> psycopg.Cursor[tuple[Any, ...]]:
+    def execute(self, statement: str, args: Iterable[object] = ()) -> psycopg.Cursor[tuple[Any, ...]]:
         return self._open.execute(_theirs(statement), tuple(args))
 
     def execute_many(self, statement: str, rows: list[tuple[object, ...]]) -> None:
@@ -297,7 +297,7 @@ class Postgres(Database):
     def stream(self, statement: str, args: Iterable[object] = ()) -> Iterator[tuple[object, ...]]:
         return self._open.cursor().stream(_theirs(statement), tuple(args))
 
-    def batch(self) -> contextlib.AbstractContextManager[Any]:
+    def batch(self) -> contextlib.AbstractContextManager[object]:
         return self._open.pipeline()
 
     def has_table(self, name: str) -> bool:
@@ -412,7 +412,7 @@ def _psycopg() -> Any:
     return psycopg
 
 
-def _settings(address: str) -> dict[str, Any]:
+def _settings(address: str) -> dict[str, object]:
     """libpq's settings. Raises ConfigError without the address's password in it."""
     scheme = address.partition(":")[0]
     if scheme not in ("postgresql", "postgres"):

@@ -81,7 +81,7 @@ class _Place(NamedTuple):
     """Whether a row replaces the one of the same key; otherwise a second one fails."""
 
 
-_PLACES: dict[type[Any], _Place] = {
+_PLACES: dict[type, _Place] = {
     records.RunRow: _Place("runs", ("run",), ("key",)),
     records.RunStateRow: _Place("run_states", ("run",), ("phase",)),
     records.SubmitRow: _Place("submits", ("run", "submit_index"), ("key",)),
@@ -105,7 +105,7 @@ _VALUES: dict[str, Callable[[Any], object]] = {
     "data": _encode,
 }
 """The columns that do not hold the row's field of their name."""
-_DECODERS: dict[type[Any], msgspec.msgpack.Decoder[Any]] = {
+_DECODERS: dict[type, msgspec.msgpack.Decoder[Any]] = {
     kind: msgspec.msgpack.Decoder(kind) for kind in _PLACES
 }
 

@@ -14,10 +14,10 @@ import ast
 import difflib
 import hashlib
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Hashable, Mapping, Sequence
 from itertools import islice
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from evopolicy_common.processes.left_files import left_files
 from evopolicy_common.records.code_metrics import parse
@@ -155,8 +155,8 @@ class _TooAlikeError(Exception):
     """The lines repeat so often that comparing them would take too long."""
 
 
-class _Matcher(difflib.SequenceMatcher[Any]):
-    def __init__(self, old: Sequence[Any], new: Sequence[Any]) -> None:
+class _Matcher(difflib.SequenceMatcher[Hashable]):
+    def __init__(self, old: Sequence[Hashable], new: Sequence[Hashable]) -> None:
         self._steps = MAX_STEPS
         self._old = old
         super().__init__(None, old, new, autojunk=False)
@@ -164,7 +164,7 @@ class _Matcher(difflib.SequenceMatcher[Any]):
     def find_longest_match(
         self, alo: int = 0, ahi: int | None = None, blo: int = 0, bhi: int | None = None
     ) -> difflib.Match:
-        places: dict[Any, list[int]] = self.b2j  # type: ignore[attr-defined]
+        places: dict[Hashable, list[int]] = self.b2j  # type: ignore[attr-defined]
         end = len(self._old) if ahi is None else ahi
         self._steps -= sum(1 + len(places.get(self._old[i], ())) for i in range(alo, end))
         if self._steps < 0:

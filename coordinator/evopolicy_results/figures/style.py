@@ -21,7 +21,7 @@ from evopolicy_results.studies.palette import Look
 _POINTS_PER_REM = 11.0
 """Points per rem of the page: figures are shown slightly larger than printed."""
 
-RC: dict[str, Any] = {
+RC: dict[str, object] = {
     "font.family": "sans-serif",
     "font.sans-serif": ["DejaVu Sans"],
     **dict.fromkeys(("font.size", "axes.labelsize"), 9.0),

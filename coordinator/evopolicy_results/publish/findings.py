@@ -4,7 +4,7 @@ documents."""
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
-from typing import Any, Literal, NamedTuple, Protocol, TypeVar
+from typing import Literal, NamedTuple, Protocol, TypeVar
 
 import msgspec
 
@@ -82,7 +82,7 @@ class PublishedRun(msgspec.Struct, frozen=True, kw_only=True):
     groups: tuple[EpisodeGroup, ...]
     opening_bytes: bytes
     result_bytes: bytes
-    as_written: dict[str, Any]
+    as_written: dict[str, object]
 
     def cases(self, split: Split) -> tuple[Case, ...]:
         return self.opening.cases(split)

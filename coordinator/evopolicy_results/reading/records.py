@@ -175,6 +175,6 @@ def path_text(path: Path) -> str:
     return os.fsencode(path).decode("utf-8", "backslashreplace")
 
 
-def rows(records: Iterable[Any]) -> list[dict[str, Any]]:
+def rows(records: Iterable[object]) -> list[dict[str, Any]]:
     """The records as dicts of plain values, fields in declared order: input for `pandas.DataFrame`."""
     return [msgspec.to_builtins(record, enc_hook=str) for record in records]

@@ -47,7 +47,7 @@ class Column(msgspec.Struct, frozen=True):
     """Whether a `number` above 0 but below its last decimal is shown as such (`<0.01`) instead of as 0."""
     note: str = ""
     """One-sentence explanation, shown on demand."""
-    of: Callable[[Any], Any] | str = ""
+    of: Callable[[Any], object] | str = ""
     """Its value in a record: a function, or a path of attributes (`at`); default: `key`."""
     spread: Callable[[Any], Estimate | Bounded | None] | None = None
     """The value with its interval, which gives the number of decimals."""

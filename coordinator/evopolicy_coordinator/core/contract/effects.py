@@ -11,7 +11,7 @@ Rules that this module owns:
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Literal
 
 import msgspec
 
@@ -91,7 +91,7 @@ class ReadFinished(msgspec.Struct, frozen=True, kw_only=True):
 class Log(msgspec.Struct, frozen=True, kw_only=True):
     level: Literal["debug", "info", "warning", "error"]
     event: str
-    fields: dict[str, Any]
+    fields: dict[str, object]
     stimulus_id: str = ""
 
 

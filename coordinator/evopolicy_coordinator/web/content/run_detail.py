@@ -13,7 +13,6 @@ from collections import OrderedDict
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from string import Formatter
-from typing import Any
 
 import msgspec
 import numpy as np
@@ -146,7 +145,7 @@ class Detail:
         """The feedback folder of a submit; empty where there is none."""
         return self._numbered("workspace/feedback/submit_", index)
 
-    def summary(self, index: int) -> Mapping[str, Any]:
+    def summary(self, index: int) -> Mapping[str, object]:
         """A submit's summary, as its agent has it; empty where there is none."""
         data = self.files.read_file(f"{self.folder_of(index)}/summary.json", _MAX_TRAJECTORY)
         return next(objects([data]), {})
@@ -181,7 +180,7 @@ class Detail:
         rewards = [ChartLine("reward", list(enumerate(map(_reward, rows))))]
         return len(rows), {"Reward": rewards, "Observation": observations, "Action": actions}, note
 
-    def _arrays(self, folder: str) -> Any:
+    def _arrays(self, folder: str) -> object:
         for name in ("observations.npy", "observations.npz"):
             with contextlib.suppress(OSError, ValueError):
                 arrays = read_arrays(self.files.read_file(f"{folder}/{name}", _MAX_TRAJECTORY), _MAX_UNPACKED)
