@@ -89,22 +89,15 @@ def answer(state: State, poll: Poll, step: CoreStep) -> None:
 
 
 def demand_permit(state: State, run: Run, step: CoreStep) -> None:
-    """Raises NotDoneError (UNAVAILABLE) while a run's agent, which may be on any machine, lacks a permit."""
-    waits_for = _implied(state, run, step) if run.state.phase == "open" else None
-    if waits_for is not None:
-        raise NotDoneError("may_not_start", waits_for=waits_for)
-
-
-def _implied(state: State, run: Run, step: CoreStep) -> Reason | None:
-    """Request the permit for any kernel for a run whose gateway requests none. Returns the reason that it waits for;
-    None when the run has a permit or needs none."""
+    """Raises NotDoneError (UNAVAILABLE) while a run's agent, which may be on any machine, lacks a permit. For a run
+    whose gateway requests none, requests the permit for any kernel."""
     kernel = permits.place(run, EVERYWHERE)
-    if kernel is None or permits.permits_of_run(state, run.id):
-        return None
+    if run.state.phase != "open" or kernel is None or permits.permits_of_run(state, run.id):
+        return
     waits_for = permits.ask_permit(state, run, PermitRow(run=run.id, boot_id=kernel), step)
     if waits_for is not None:
         state.timers.arm(("ask", (run.id, kernel)), step.now + ASK_AGAIN_S)
-    return waits_for
+        raise NotDoneError("may_not_start", waits_for=waits_for)
 
 
 def agent_gone(state: State, event: events.Requested[operator.AgentGone], step: CoreStep) -> None:
