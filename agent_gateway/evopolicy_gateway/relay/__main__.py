@@ -46,7 +46,9 @@ async def tell(
         await sleep(_TELL_S)
         if used.requests != told:
             told = used.requests
-            say(used.use_text(prices))
+            cost = "" if prices is None else f", {used.cost(prices):,.2f} dollars"
+            failed = f" ({used.failed:,} failed)" if used.failed else ""
+            say(f"{told:,} requests{failed}, {used.usage.total:,} tokens{cost} so far")
 
 
 async def _main(fd: int) -> None:

@@ -152,12 +152,6 @@ class Used(msgspec.Struct, kw_only=True):
         cost = {} if prices is None else {"cost": round(self.cost(prices), 6)}
         return self.usage.recorded(None) | cost
 
-    def use_text(self, prices: Prices | None) -> str:
-        """One line for people."""
-        cost = "" if prices is None else f", {self.cost(prices):,.2f} dollars"
-        failed = f" ({self.failed:,} failed)" if self.failed else ""
-        return f"{self.requests:,} requests{failed}, {self.usage.total:,} tokens{cost} so far"
-
 
 def _count(counts: dict[str, int], name: str) -> None:
     if name in counts or len(counts) < _MAX_NAMES:

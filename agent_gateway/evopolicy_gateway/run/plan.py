@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import msgspec
 
 from evopolicy_common import catalogue
-from evopolicy_common.errors import ConfigError, EvopolicyError, ProtocolError, raised_as
+from evopolicy_common.errors import DECODE_ERRORS, ConfigError, EvopolicyError, ProtocolError, raised_as
 from evopolicy_common.messages.environment import StepLimit
 from evopolicy_common.messages.operator import CreateRun
 from evopolicy_common.messages.run_settings import RunSettings, Start
@@ -37,7 +37,7 @@ from evopolicy_gateway.run_folder.listener import Listener, check_agent
 from evopolicy_gateway.run_folder.locks import check_free
 from evopolicy_gateway.workspace import prompts as workspace_prompts
 from evopolicy_gateway.workspace.agents_md import PLACEHOLDERS
-from evopolicy_gateway.workspace.prompts import Prompts, read_prompts, read_text
+from evopolicy_gateway.workspace.prompts import Prompts, read_text
 
 
 class Texts(msgspec.Struct, frozen=True, kw_only=True):
@@ -64,7 +64,10 @@ def read_texts(
         text = read_text(path)
         workspace_prompts.check_text(str(path), text, PLACEHOLDERS)
     if prompts is not None:
-        chosen = read_prompts(shipped.found(prompts, started_in))
+        path = shipped.found(prompts, started_in)
+        with raised_as(ConfigError, path, *DECODE_ERRORS):
+            chosen = msgspec.toml.decode(read_text(path), type=Prompts)
+        chosen.check(str(path))
     declared = () if config is None else inputs.read_inputs(config.skills, config.mcp, started_in)
     return Texts(agents_md=text, prompts=chosen, inputs=tuple(each.recorded for each in declared))
 

@@ -12,7 +12,7 @@ from string import Template
 
 import msgspec
 
-from evopolicy_common.errors import DECODE_ERRORS, ConfigError, raised_as
+from evopolicy_common.errors import ConfigError, raised_as
 from evopolicy_common.regular_files import read_given
 
 FIRST = (
@@ -82,14 +82,6 @@ def left(wall_s: float, n_tokens: int) -> str:
     """Addition to a prompt that says how much is left of the agent's limits."""
     minutes = max(0, round(wall_s / 60.0))
     return f" Left: {minutes // 60} h {minutes % 60:02} min of time, {n_tokens:,} tokens of the model."
-
-
-def read_prompts(path: Path) -> Prompts:
-    """The prompts in a TOML file. Raises ConfigError that names the file and the fault."""
-    with raised_as(ConfigError, path, *DECODE_ERRORS):
-        prompts = msgspec.toml.decode(read_text(path), type=Prompts)
-    prompts.check(str(path))
-    return prompts
 
 
 def read_text(path: Path) -> str:

@@ -23,7 +23,6 @@ from evopolicy_gateway.harnesses.coding_agents.acp_stream import (
     Acp,
     AcpReader,
     Choice,
-    judges_itself,
     offered_choice,
     offered_modes,
     permission,
@@ -148,7 +147,10 @@ class AcpAgent(CliAgent):
         name a model that did not play. Likewise for the effort.
         """
         modes = offered_modes(answer)
-        mode = self._acp.table.mode or (MODE_THAT_ASKS if judges_itself(modes) else "")
+        # In `auto`, where Qwen Code and Claude Code begin, a model of the agent's own decides what is allowed. It costs
+        # tokens, and may refuse what the rules of the run allow.
+        judges_itself = modes is not None and modes.current == "auto" and MODE_THAT_ASKS in modes.values
+        mode = self._acp.table.mode or (MODE_THAT_ASKS if judges_itself else "")
         if mode and modes is not None and modes.option:
             await link.choose(modes, mode)
         elif mode:

@@ -177,14 +177,6 @@ def offered_modes(answer: Mapping[str, object]) -> Choice | None:
     return Choice("", string(modes.get("currentModeId")), {each: each for each in ids})
 
 
-def judges_itself(modes: Choice | None) -> bool:
-    """Whether a session began in the mode in which a model of the agent's own decides what is allowed, and could ask
-    instead.
-
-    That model costs tokens and may refuse what the rules of the run allow. Qwen Code and Claude Code begin in it."""
-    return modes is not None and modes.current == "auto" and MODE_THAT_ASKS in modes.values
-
-
 def usage_of(usage: Mapping[str, object]) -> Usage:
     """The paper's token counts from the protocol's `usage`, whose total shows whether the input includes cached
     tokens."""

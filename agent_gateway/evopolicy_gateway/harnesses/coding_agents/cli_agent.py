@@ -122,7 +122,8 @@ class CliAgent(Harness):
         stage.log.note({"type": "prompt", "turn": state.turns, "session": begun, "message": prompt})
         reader = dialect.reader()
         # A cumulative stream repeats the usage of this session's earlier turns, so these are not added again.
-        spent = state.usage_without(begun) if dialect.cumulative else state.usage
+        counted = (used for one, used in state.used.items() if not dialect.cumulative or one != begun)
+        spent = sum(counted, Usage())
         reported = Usage()
 
         def capped(now: TurnReader) -> str | None:

@@ -88,15 +88,13 @@ class CodexReader(TurnReader):
             self.done = False
             self.failure = turn_failure_of(string(mapping(event.get("error")).get("message")))
         elif kind == "error":
-            self._error(string(event.get("message")))
+            message = string(event.get("message"))
+            if message.startswith(_NOTICE):
+                self.requests_failed += 1
+            elif not self.done:
+                self.failure = turn_failure_of(message)
         elif kind in ("item.started", "item.updated", "item.completed"):
             self._item(mapping(event.get("item")), completed=kind == "item.completed")
-
-    def _error(self, message: str) -> None:
-        if message.startswith(_NOTICE):
-            self.requests_failed += 1
-        elif not self.done:
-            self.failure = turn_failure_of(message)
 
     def _item(self, item: Mapping[str, object], *, completed: bool) -> None:
         kind = item.get("type") or item.get("item_type")

@@ -34,10 +34,6 @@ class SessionState(msgspec.Struct, kw_only=True):
         """Token use of the whole run."""
         return sum(self.used.values(), Usage())
 
-    def usage_without(self, session: str | None) -> Usage:
-        """Token use of all sessions except this one."""
-        return sum((usage for known, usage in self.used.items() if known != session), Usage())
-
     def add_usage(self, session: str, usage: Usage, *, cumulative: bool) -> None:
         """Records the usage of a finished turn."""
         if cumulative:
