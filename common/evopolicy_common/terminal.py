@@ -19,8 +19,6 @@ from typing import TYPE_CHECKING, TextIO
 from evopolicy_common.installation import as_called
 
 if TYPE_CHECKING:
-    import logging
-
     from typing_extensions import Buffer
 
 _ODD = re.compile(r"[^\n\t -~]")
@@ -149,7 +147,9 @@ class _WatchedStdout(io.FileIO):
             with open(os.devnull, "wb") as nowhere:
                 os.dup2(nowhere.fileno(), self.fileno())
             # SystemExit ends the loop, so asyncio must not report an unretrieved exception of the task.
-            logging.getLogger("asyncio").addFilter(_is_no_exit)
+            logging.getLogger("asyncio").addFilter(
+                lambda record: not (record.exc_info and isinstance(record.exc_info[1], SystemExit))
+            )
             raise SystemExit(READER_GONE) from None
 
 
@@ -190,7 +190,3 @@ def _replaced(stream: TextIO, raw: type[io.FileIO]) -> TextIO:
         errors=stream.errors,
         line_buffering=stream.line_buffering,
     )
-
-
-def _is_no_exit(record: logging.LogRecord) -> bool:
-    return not (record.exc_info and isinstance(record.exc_info[1], SystemExit))

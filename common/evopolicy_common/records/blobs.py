@@ -264,15 +264,12 @@ class BlobStore:
 
     def _finish(self, part: Path, digest: str) -> FileState:
         """Stores the blob whose bytes are in `part`. Raises StorageError when they are others."""
-        self._check(part, digest)
-        return self._keep(part, digest)
-
-    def _check(self, part: Path, digest: str) -> None:
         with part.open("rb") as file:
             actual = hashlib.file_digest(file, "sha256").hexdigest()
         if actual != digest:
             part.unlink()
             raise StorageError(f"uploaded bytes are not blob {digest}; upload it again")
+        return self._keep(part, digest)
 
     def _keep(self, part: Path, digest: str) -> FileState:
         path = self.path(digest)

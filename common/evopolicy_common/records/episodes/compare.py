@@ -53,8 +53,15 @@ def action_log(actions: Iterable[Any]) -> bytes:
 def episode_difference(
     ours: EpisodeOutcome, recorded: Trajectory, theirs: EpisodeOutcome, replayed: Trajectory
 ) -> str | None:
-    """The first difference of two outcomes of the same actions, or their trajectories; None without."""
-    return first_difference(recorded, replayed) or outcome_difference(ours, theirs)
+    """The first difference of two trajectories of the same actions, or of their outcomes, as `length 3 and 4`; None
+    without. Ignores failure, output and times."""
+    if difference := first_difference(recorded, replayed):
+        return difference
+    for name in ("episode_return", "length", "terminated", "truncated", "reward_components"):
+        one, other = getattr(ours, name), getattr(theirs, name)
+        if not same(one, other):
+            return f"{name.replace('_', ' ')} {one!r} and {other!r}"
+    return None
 
 
 def first_difference(recorded: Trajectory, replayed: Trajectory) -> str | None:
@@ -100,15 +107,6 @@ def _rendered_difference(recorded: Trajectory, replayed: Trajectory) -> str | No
         read_arrays(file, MAX_BYTES) if (file := files.get(OBSERVATIONS)) else {} for files in (ours, theirs)
     ]
     return None if same(*arrays) else "the observations differ"
-
-
-def outcome_difference(ours: EpisodeOutcome, theirs: EpisodeOutcome) -> str | None:
-    """Describes a difference of an episode's own numbers, as `length 3 and 4`; ignores failure, output and times."""
-    for name in ("episode_return", "length", "terminated", "truncated", "reward_components"):
-        one, other = getattr(ours, name), getattr(theirs, name)
-        if not same(one, other):
-            return f"{name.replace('_', ' ')} {one!r} and {other!r}"
-    return None
 
 
 def same(left: Any, right: Any) -> bool:

@@ -313,7 +313,10 @@ def files_of(episode: Trajectory, storage: ObsStorage | None) -> dict[str, bytes
     limit."""
     if episode.files:
         return episode.files
-    outside = storage != "inline" if storage is not None else _holds_pictures(episode.obs)
+    outside = storage != "inline"
+    if storage is None:
+        arrays = [leaf for _, leaf in columns.leaves(episode.obs) if isinstance(leaf, np.ndarray)]
+        outside = any(is_picture(leaf.shape[1:], leaf.dtype.name) for leaf in arrays)
     _, obs, *others = zip(*episode.rows(), strict=True) if episode.n else ((),) * len(Row._fields)
     files = {ROWS: b"".join(_texts([None if outside else obs, *others], 0, 0))}
     if outside and episode.obs is not None:
@@ -330,11 +333,6 @@ def is_picture(shape: tuple[int, ...], dtype: str) -> bool:
         return False
     channels = len(shape) > 2 and shape[-1] < MIN_PICTURE_SIDE
     return min(shape[-3:-1] if channels else shape[-2:]) >= MIN_PICTURE_SIDE
-
-
-def _holds_pictures(obs: Any) -> bool:
-    arrays = [leaf for _, leaf in columns.leaves(obs) if isinstance(leaf, np.ndarray)]
-    return any(is_picture(leaf.shape[1:], leaf.dtype.name) for leaf in arrays)
 
 
 def _parts(data: bytes) -> list[memoryview]:
