@@ -166,7 +166,7 @@ class AnswerReader:
         return True
 
 
-def values(document: Any, path: str) -> Iterator[Any]:
+def values(document: object, path: str) -> Iterator[Any]:
     """Yields every value at a dotted path; nothing for an empty path. `*` stands for each element of a list, and
     `[name=value]` for an object with that value."""
     if not path:

@@ -180,7 +180,7 @@ def _tools(document: dict[str, object], rules: RequestRules) -> tuple[list[str],
     return hosted, unknown
 
 
-def _offered(document: dict[str, object]) -> Iterator[tuple[str, Any]]:
+def _offered(document: dict[str, object]) -> Iterator[tuple[str, object]]:
     """Every tool with its place: those of a message (a search for tools brings some) and of a namespace too."""
     items = document.get("input")
     holders = [("", document)] + [

@@ -70,20 +70,20 @@ def initial_policy(action_space: SpaceSchema) -> str:
     return _SOURCE.replace("{action}", action.replace("\n", "\n" + " " * 22))
 
 
-def constant_action(space: SpaceSchema) -> Any:
+def constant_action(space: SpaceSchema) -> object:
     """A plain action inside `space`: zero, else the nearest bound. ValueError for an unknown space."""
     if space["type"] not in _CONSTANT:
         raise ValueError(f"no action for a space of type {space['type']!r}")
     return _CONSTANT[space["type"]](space)
 
 
-def _in_box(space: SpaceSchema) -> Any:
+def _in_box(space: SpaceSchema) -> object:
     low, high = space.get("low", space.get("min")), space.get("high", space.get("max"))
     number = float if str(space["dtype"]).startswith("float") else int
     return _box(list(space["shape"]), low, high, number)
 
 
-_CONSTANT: dict[str, Callable[[SpaceSchema], Any]] = {
+_CONSTANT: dict[str, Callable[[SpaceSchema], object]] = {
     "Discrete": lambda space: int(space.get("start", 0)),
     "Box": _in_box,
     "Image": lambda space: _box(space["shape"], space["value_range"][0], space["value_range"][1], int),
@@ -104,14 +104,14 @@ _CONSTANT: dict[str, Callable[[SpaceSchema], Any]] = {
 }
 
 
-def _box(shape: list[int], low: Any, high: Any, number: type[int] | type[float]) -> Any:
+def _box(shape: list[int], low: Any, high: Any, number: type[int] | type[float]) -> object:
     if not shape:
         return number(min(max(0.0, float(low)), float(high)))
     lows, highs = (each if isinstance(each, list) else [each] * shape[0] for each in (low, high))
     return [_box(shape[1:], *bounds, number) for bounds in zip(lows, highs, strict=True)]
 
 
-def _like(nvec: Any, start: Any) -> Any:
+def _like(nvec: object, start: Any) -> object:
     """The lowest value of each element of a MultiDiscrete space."""
     if not isinstance(nvec, list):
         return int(start)

@@ -199,7 +199,7 @@ def _unusable(value: str, *, several_lines: bool) -> str:
     return "" if shown == value else "has characters that cannot be printed"
 
 
-def _usage_text(error: Any) -> str:
+def _usage_text(error: TyperException) -> str:
     errors: list[Any] = getattr(error.__cause__, "errors", list)()
     if errors and errors[0]["type"] in _WRONG:
         error.message = (

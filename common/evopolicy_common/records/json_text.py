@@ -36,11 +36,11 @@ def json_bytes(value: object) -> bytes:
         return json.dumps(cleaned, separators=(",", ":"), allow_nan=False, default=_numpy_as_plain).encode()
 
 
-def _numpy_as_plain(value: object) -> Any:
+def _numpy_as_plain(value: object) -> object:
     return json.loads(orjson.dumps(value, option=orjson.OPT_SERIALIZE_NUMPY))
 
 
-def plain(value: Any) -> Any:
+def plain(value: object) -> Any:
     """`value` with every number that JSON cannot represent as text; arrays without such numbers stay arrays."""
     if isinstance(value, float | np.floating):
         if not np.isfinite(value):

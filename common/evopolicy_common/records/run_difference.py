@@ -125,7 +125,7 @@ def _parse(name: str, data: bytes) -> Any:
     return json.loads(data)
 
 
-def _value_differences(path: str, left: Any, right: Any) -> list[tuple[str, Any, Any]]:
+def _value_differences(path: str, left: Any, right: Any) -> list[tuple[str, object, object]]:
     """Paths at which two JSON values differ, with both values; a missing field differs from every value."""
     if isinstance(left, dict) and isinstance(right, dict):
         differing = []

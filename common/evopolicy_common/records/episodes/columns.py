@@ -70,7 +70,7 @@ class Pictures:
         self._stream = zstandard.ZstdCompressor(level=1).compressobj()
         self._pieces: list[bytes] = []
 
-    def add(self, picture: Any, /) -> bool:
+    def add(self, picture: object, /) -> bool:
         """Adds a picture. Returns True, without a change, when its shape or dtype differs from the first."""
         if type(picture) is not np.ndarray or picture.dtype != self._dtype or picture.shape != self._shape:
             return True
@@ -127,7 +127,7 @@ class StepColumn:
         return parts if self.kind == "dict" else tuple(parts.values())
 
 
-def leaves(values: Any, path: str = "") -> Iterator[tuple[str, Any]]:
+def leaves(values: object, path: str = "") -> Iterator[tuple[str, Any]]:
     """The leaves of `StepColumn.values()` by path: keys and positions joined by `/`; empty for a single leaf."""
     if isinstance(values, dict):
         for key, item in values.items():
@@ -245,7 +245,7 @@ def _array(dtype: str, data: bytes) -> NDArray[Any]:
     return np.frombuffer(data, dtype=_dtype(dtype))
 
 
-def _enc_hook(value: Any) -> Any:
+def _enc_hook(value: object) -> Any:
     if isinstance(value, np.ndarray) and value.dtype.kind in "biuf":
         _check_shape(value.shape)
         head = [value.dtype.str, list(value.shape), value.tobytes()]
@@ -269,7 +269,7 @@ encoder = msgspec.msgpack.Encoder(enc_hook=_enc_hook)
 decoder = msgspec.msgpack.Decoder(ext_hook=_ext_hook)
 
 
-def encode(block: Any) -> bytes:
+def encode(block: object) -> bytes:
     """Encodes a block, or another value made of plain ones and arrays."""
     try:
         return encoder.encode(block)
@@ -278,7 +278,7 @@ def encode(block: Any) -> bytes:
         return encoder.encode(_portable(block))
 
 
-def _portable(value: Any) -> Any:
+def _portable(value: object) -> Any:
     if isinstance(value, str):
         return value.encode("utf-8", "backslashreplace").decode()
     if isinstance(value, int) and not -(2**63) <= value < 2**63:

@@ -41,7 +41,7 @@ _HEADER_BYTES = 1 << 16
 """More than the header of an array in a file takes."""
 
 
-def action_log(actions: Iterable[Any]) -> bytes:
+def action_log(actions: Iterable[object]) -> bytes:
     """A trajectory's bytes with these actions and nothing else, for a replay of the episode."""
     recorder = Recorder("actions")
     for action in actions:
@@ -204,7 +204,7 @@ def _file_difference(folder: Path, _: Rows, episode: Trajectory) -> str | None:
     return None if same(read_arrays(data, most), arrays) else f"{OBSERVATIONS} differs"
 
 
-def reads_as(text: Any, value: Any) -> bool:
+def reads_as(text: object, value: object) -> bool:
     """Whether the JSON value `text` is the spelling of `value` in feedback files."""
     if isinstance(value, np.ndarray) and not value.ndim:
         value = value[()]
@@ -273,7 +273,7 @@ def _comparable(recorded: dict[str, Any], replayed: dict[str, Any]) -> tuple[dic
     return recorded, replayed
 
 
-def _action(text: Any) -> Any:
+def _action(text: object) -> Any:
     if isinstance(text, str):
         return _NAMES.get(text, text)
     if isinstance(text, list):

@@ -101,7 +101,7 @@ class Renderer(Recorder):
         # Observations are kept for a block, until they are rendered.
         self._full = True
         self._npz = None if storage == "inline" else NpzWriter(MAX_RECORDED_BYTES)
-        self._held: deque[tuple[str, Any]] = deque()
+        self._held: deque[tuple[str, np.ndarray[Any, Any] | list[Any]]] = deque()
         self._held_bytes = 0
         self._compressor = zstandard.ZstdCompressor(level=1).compressobj()
         self._rows: list[bytes] = []
@@ -144,7 +144,7 @@ class Renderer(Recorder):
         # Arrays are held outside the block: a block of pictures would be large.
         return self._take_array if self._npz is not None and isinstance(obs, np.ndarray) else self._obs.append
 
-    def _take_array(self, obs: Any) -> bool:
+    def _take_array(self, obs: object) -> bool:
         if isinstance(obs, np.ndarray):
             self._hold(SINGLE, obs[np.newaxis])
             return False
@@ -177,7 +177,7 @@ class Renderer(Recorder):
         except ProtocolError as error:
             self._left_out = str(error)
 
-    def _hold(self, name: str, rows: Any) -> None:
+    def _hold(self, name: str, rows: np.ndarray[Any, Any] | list[Any]) -> None:
         self._held.append((name, rows))
         self._held_bytes += getattr(rows, "nbytes", 0)
         if self._held_bytes > HELD_BYTES:

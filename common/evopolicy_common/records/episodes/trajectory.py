@@ -140,7 +140,7 @@ class Recorder:
             self._flush()
         return b"".join([*self._parts, _LENGTH.pack(0)])
 
-    def _begin_block(self, obs: Any, action: Any) -> None:
+    def _begin_block(self, obs: object, action: object) -> None:
         """Starts a block. Its first row alone decides its kind, so that equal rows give equal bytes."""
         most = MAX_BLOCK_BYTES // 2 // max(1, _size(action))
         if self._full:
@@ -284,7 +284,7 @@ def _frames(data: bytes) -> Iterator[bytes]:
         raise ValueError(f"{len(data) - at} bytes follow the end")
 
 
-def _size(obs: Any) -> int:
+def _size(obs: object) -> int:
     """Approximate size of an observation, bytes."""
     if isinstance(obs, np.ndarray):
         return int(obs.nbytes)
