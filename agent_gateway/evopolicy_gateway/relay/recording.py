@@ -25,8 +25,8 @@ from evopolicy_common.errors import ConfigError
 from evopolicy_common.records import model_record
 from evopolicy_common.records.model_record import (
     Level,
+    ModelCall,
     Pack,
-    RecordedCall,
     StoredRequest,
     key_of,
     read_calls,
@@ -136,7 +136,7 @@ class CallRecorder:
         if self._n >= model_record.MAX_CALLS:
             raise ValueError(f"its limit of {model_record.MAX_CALLS:,} calls is reached")
         request = canonical(sent.name, self._clean(sent.body))
-        line = RecordedCall(
+        line = ModelCall(
             n=n, api=sent.name, method=sent.method, digest=key_of(request), status=0, broken=True
         )
         if answer is not None:

@@ -1,6 +1,6 @@
 """`logs/model/`: the record of a run's calls of its model, which the relay writes and `evopolicy replay` answers from.
 
-- `calls.jsonl` has a line for each call (`RecordedCall`), in the order in which the calls ended.
+- `calls.jsonl` has a line for each call (`ModelCall`), in the order in which the calls ended.
 - `content.pack` has the requests and answers, each text once: frames of a digest (16 bytes), a length (4 bytes) and
   that many bytes, compressed by Zstandard. It is missing at the level `digests`.
 - `stopped` tells why recording ended before the run; it is missing in a whole record.
@@ -38,7 +38,7 @@ _KEY = 16
 _HEAD = _KEY + 4
 
 
-class RecordedCall(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
+class ModelCall(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
     """One call. Digests are the first 32 hex digits of a SHA-256."""
 
     n: int
@@ -62,7 +62,7 @@ class RecordedCall(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True
     """Why the answer's content is not kept; empty where it is, or its level keeps none."""
 
 
-_decoder = msgspec.json.Decoder(RecordedCall)
+_decoder = msgspec.json.Decoder(ModelCall)
 
 
 def key_of(data: bytes) -> str:
@@ -144,7 +144,7 @@ class Pack:
         self._file.close()
 
 
-def read_calls(folder: Path) -> list[RecordedCall]:
+def read_calls(folder: Path) -> list[ModelCall]:
     """The readable calls of a record, by their start. Raises ConfigError when there is no record."""
     path = folder / CALLS
     with raised_as(ConfigError, f"{path} cannot be read", OSError):
@@ -164,7 +164,7 @@ def stopped(run: Path) -> str:
         return ""
 
 
-def request_of(pack: Pack, call: RecordedCall) -> Any:
+def request_of(pack: Pack, call: ModelCall) -> Any:
     """The recorded request's canonical JSON value. Raises ConfigError."""
     kept = msgspec.json.decode(pack.get(call.request), type=StoredRequest)
     lists = {name: [msgspec.json.decode(pack.get(key)) for key in keys] for name, keys in kept.lists.items()}

@@ -185,7 +185,7 @@ class Findings(msgspec.Struct, kw_only=True):
         self.claim(name, claims)
 
 
-class DocumentFault(NamedTuple):
+class Flaw(NamedTuple):
     kind: str
     text: str
 

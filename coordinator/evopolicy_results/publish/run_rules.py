@@ -28,9 +28,9 @@ from evopolicy_results.publish.contents import EpisodeGroup
 from evopolicy_results.publish.findings import (
     KINDS,
     UPDATE,
-    DocumentFault,
     FileSet,
     Findings,
+    Flaw,
     History,
     PublishedRun,
     decoded,
@@ -77,10 +77,7 @@ def check_run(
 ) -> None:
     name = run.opening.run
     for kind, rule in _RULES.items():
-        faults = [
-            each if isinstance(each, DocumentFault) else DocumentFault(kind, each)
-            for each in rule(run, history)
-        ]
+        faults = [each if isinstance(each, Flaw) else Flaw(kind, each) for each in rule(run, history)]
         for fault in faults:
             checked.add(fault.kind, "failed", fault.text, name)
         if not faults:
@@ -116,11 +113,11 @@ def check_starts(checked: Findings) -> None:
                 checked.add("commitment", "failed", text, name)
 
 
-def _commitment(run: PublishedRun, history: History) -> Iterator[str | DocumentFault]:
+def _commitment(run: PublishedRun, history: History) -> Iterator[str | Flaw]:
     opening, settings, place = run.opening, run.opening.settings, run.record.committed
     numbered = history.entry(Opened, opening.run)
     if numbered is None:
-        yield DocumentFault("journal", "the journal has no entry of this run")
+        yield Flaw("journal", "the journal has no entry of this run")
         return
     number, entry = numbered
     if len(run.salt) != journal.SALT_BYTES:
@@ -131,14 +128,10 @@ def _commitment(run: PublishedRun, history: History) -> Iterator[str | DocumentF
     if entry.epoch != opening.epoch or any(getattr(entry, name) != getattr(settings, name) for name in names):
         yield "the journal opened it for another entry, environment, experiment, epoch or start"
     if entry.start is not None and history.entry(Opened, entry.start.run) is None:
-        yield DocumentFault(
-            "journal", f"it starts from run {entry.start.run}, of which the journal has no entry"
-        )
+        yield Flaw("journal", f"it starts from run {entry.start.run}, of which the journal has no entry")
     fixed = (entry.commitment, number, history.heads[number], entry.epoch)
     if place is None or (place.commitment, place.opened, place.opened_head, place.epoch) != fixed:
-        yield DocumentFault(
-            "record", "run.json has another commitment or head of the journal than the journal has"
-        )
+        yield Flaw("record", "run.json has another commitment or head of the journal than the journal has")
     if of := settings.replay_of or entry.replay_of:
         yield f"it is a replay of run {of}, and no run of its own"
     if repeated := overlaps({split: run.cases(split) for split in SPLITS}):
@@ -151,7 +144,7 @@ def _disclosure(run: PublishedRun, history: History) -> Iterator[str]:
         yield f"epoch {epoch} was not revealed: its cases may still be played as secret ones"
 
 
-def _result(run: PublishedRun, history: History) -> Iterator[str | DocumentFault]:
+def _result(run: PublishedRun, history: History) -> Iterator[str | Flaw]:
     numbered, place = history.entry(Ended, run.opening.run), run.record.committed
     if numbered is None:
         yield "the journal has no end of this run"
@@ -162,10 +155,10 @@ def _result(run: PublishedRun, history: History) -> Iterator[str | DocumentFault
     if run.result.status != entry.status:
         yield f"it ended as {entry.status}, not as {run.result.status}"
     if place is None or (place.ended, place.ended_head) != (number, history.heads[number]):
-        yield DocumentFault("record", "run.json has another end of the run than the journal has")
+        yield Flaw("record", "run.json has another end of the run than the journal has")
 
 
-def _record(run: PublishedRun, history: History) -> Iterator[str | DocumentFault]:
+def _record(run: PublishedRun, history: History) -> Iterator[str | Flaw]:
     """`run.json`, compared with what `account.run_record` makes of the committed documents and of its claims."""
     record, opening, result, place = run.record, run.opening, run.result, run.record.committed
     if place is None:
@@ -200,9 +193,7 @@ def _record(run: PublishedRun, history: History) -> Iterator[str | DocumentFault
     )
     for name, here, wanted in unlike_documents(run.as_written, as_json(account.run_record(finished, claims))):
         if wanted is MISSING:
-            yield DocumentFault(
-                "format", f"run.json: {name[:120]} is no field of published results: {UPDATE}"
-            )
+            yield Flaw("format", f"run.json: {name[:120]} is no field of published results: {UPDATE}")
         else:
             yield f"run.json has {name} {short(here)}; the committed documents give {short(wanted)}"
     told_inputs = inputs_digest(record.agent.inputs)
@@ -322,7 +313,7 @@ def _chosen_world(run: PublishedRun) -> str:
     return f"{env} has candidate {number} of {worlds.CANDIDATES}: {how}"
 
 
-_RULES: dict[str, Callable[[PublishedRun, History], Iterator[str | DocumentFault]]] = {
+_RULES: dict[str, Callable[[PublishedRun, History], Iterator[str | Flaw]]] = {
     "commitment": _commitment,
     "disclosure": _disclosure,
     "result": _result,
@@ -332,7 +323,7 @@ _RULES: dict[str, Callable[[PublishedRun, History], Iterator[str | DocumentFault
     "scores": _scores,
     "worlds": _worlds,
 }
-"""By the kind of their findings; a `DocumentFault` is of another kind."""
+"""By the kind of their findings; a `Flaw` is of another kind."""
 
 
 def _recordings(files: FileSet, run: PublishedRun, damaged: set[str], checked: Findings) -> None:
