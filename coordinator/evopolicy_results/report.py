@@ -61,14 +61,15 @@ def write_report(
     *,
     title: str | None = None,
     traces: bool = True,
+    places: Mapping[Path, str] | None = None,
     processes: Processes = ALONE,
     progress: Progress | None = None,
 ) -> Path:
     """Writes the report of `study` into the folder `out` (created if missing) and returns its `index.html`.
 
     Raises ConfigError when `out` exists and is neither empty nor an earlier report. Without `traces` the pages of
-    single runs are left out, which saves most of the time and space of a large report. `processes` draw figures
-    and write the pages of runs; call it on the main thread.
+    single runs are left out, which saves most of the time and space of a large report. `places`: other texts for the paths of
+    runs in `report.json`. `processes` draw figures and write the pages of runs; call it on the main thread.
     """
     tell = progress or (lambda what, done, total: None)
     check_folder(out, _OURS.__contains__, "report")
@@ -103,7 +104,7 @@ def write_report(
         for _, suffix in FORMS:
             write_file(out / "tables" / f"{table.name}.{suffix}", _WRITTEN[suffix](table))
         tell("tables", done, len(tables))
-    (out / "report.json").write_bytes(_report_json(study, tables, plots))
+    (out / "report.json").write_bytes(_report_json(study, tables, plots, places or {}))
     text = index_page(
         study,
         title=title,
@@ -230,13 +231,13 @@ def write_file(path: Path, text: str) -> Path:
     return path
 
 
-def _report_json(study: Study, tables: list[Table], plots: list[Plot]) -> bytes:
+def _report_json(study: Study, tables: list[Table], plots: list[Plot], places: Mapping[Path, str]) -> bytes:
     content = {
         "schema_version": REPORT_SCHEMA_VERSION,
         "runs": [
             {
                 "name": run.name,
-                "path": path_text(run.path),
+                "path": places.get(run.path) or path_text(run.path),
                 "entry": run.entry,
                 "env": run.env,
                 "exp_id": run.record.exp_id,

@@ -86,7 +86,10 @@ def _write_pages(bundles: Sequence[LabBundle], out: Path, title: str, tell: Tell
         tell(f"board {number} of {len(all_boards)}: {len(board.runs)} runs")
         study = study_of(board.runs, allow_mixed=True)
         folder = f"board-{number}"
-        write_report(study, out / folder, title=f"{title}, board {number}")
+        places = {
+            run.path: f"{each.file}/runs/{run.path.name}" for each in board.bundles for run in each.runs
+        }
+        write_report(study, out / folder, title=f"{title}, board {number}", places=places)
         entries |= set(study.entries)
         reference = reference or study.reference
         sections.append(_board(board, study, number, folder))

@@ -3,6 +3,7 @@ machine."""
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -84,6 +85,13 @@ def test_runs_of_one_name_in_two_files_have_own_pages(tmp_path: Path) -> None:
     names = [bundle.runs[0].name for bundle in bundles]
     assert len(set(names)) == 3
     assert [name.rpartition(" (")[2] for name in names[1:]] == ["second-0)", "third-0)"]
+
+
+def test_a_board_says_of_its_runs_in_which_file_they_are(tmp_path: Path) -> None:
+    write.write_site([bundle(tmp_path, A, "Lab-A", "evolve")], tmp_path / "site")
+    text = (tmp_path / "site" / "board-1" / "report.json").read_text()
+    assert [each["path"] for each in json.loads(text)["runs"]] == ["x.evp/runs/exp"]
+    assert str(tmp_path) not in text
 
 
 def test_an_unpacked_run_names_no_files_of_this_machine(tmp_path: Path) -> None:
