@@ -68,8 +68,9 @@ def write_report(
     """Writes the report of `study` into the folder `out` (created if missing) and returns its `index.html`.
 
     Raises ConfigError when `out` exists and is neither empty nor an earlier report. Without `traces` the pages of
-    single runs are left out, which saves most of the time and space of a large report. `places`: other texts for the paths of
-    runs in `report.json`. `processes` draw figures and write the pages of runs; call it on the main thread.
+    single runs are left out, which saves most of the time and space of a large report. `places`: other texts
+    for the paths of runs in `report.json`. `processes` draw figures and write the pages of runs; call it on the main
+    thread.
     """
     tell = progress or (lambda what, done, total: None)
     check_folder(out, _OURS.__contains__, "report")
