@@ -1,4 +1,4 @@
-"""What agents and policies are told of an environment in the published profiles, as the published software has it."""
+"""An environment's facts for agents and policies in the published profiles, as the published software has them."""
 
 from __future__ import annotations
 

@@ -29,7 +29,7 @@ _MAX_NAMES, _SHOWN = 20, 200
 
 
 class RequestRules(msgspec.Struct, frozen=True, kw_only=True):
-    """What a request of an API may have."""
+    """The permitted parts of an API's request."""
 
     fields: dict[str, Any]
     tools: dict[str, Any]
@@ -75,7 +75,7 @@ _HOSTED_FIELDS = (
 
 
 class RequestFacts(msgspec.Struct, frozen=True, kw_only=True):
-    """What the relay needs to know of a request."""
+    """The facts about a request that the relay decides by."""
 
     body: bytes = b""
     """The document as it was understood; empty for a request without."""

@@ -180,7 +180,7 @@ class Relay:
         return route
 
     async def _facts(self, exchange: _Exchange, request: Request, route: Route) -> RequestFacts:
-        """What the request asks for. Raises _RefusedError."""
+        """The facts about the request. Raises _RefusedError."""
         if request.method == "GET":
             return RequestFacts()
         try:

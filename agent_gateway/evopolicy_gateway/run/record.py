@@ -171,7 +171,7 @@ async def write(
 
 
 def claims(plan: Plan, facts: dict[str, object], staged: Staged | None, times: Times) -> Claims:
-    """What this side knows of a run before its end; pure. `facts`: about the agent. `staged` None: no workspace."""
+    """This side's facts about a run before its end; pure. `facts`: about the agent. `staged` None: no workspace."""
     return Claims(
         agent=_agent(plan, facts, times),
         jail=plan.jail.recorded,

@@ -216,7 +216,7 @@ def _data(where: str, path: Path, names: tuple[str, ...]) -> tuple[str, ...]:
 
 
 def _fault(entry: Entry) -> str:
-    """What is wrong with a foreign definition; empty if nothing is."""
+    """The fault of a foreign definition; empty if it has none."""
     names = (entry.success, *entry.reward_components, *entry.reward_vector, *entry.info_strings)
     long_name = next((name for name in names if len(name) > _MAX_ID or not name.isprintable()), None)
     long_text = next((text for text in entry.reward_components.values() if len(text) > _MAX_REWARD_TEXT), "")

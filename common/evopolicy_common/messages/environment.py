@@ -82,7 +82,7 @@ class EnvironmentDescription(msgspec.Struct, frozen=True, kw_only=True):
     """Keys of info that had text in these steps, which feedback leaves out."""
 
     def notes(self) -> str:
-        """What its author should know, with the remedy; empty if there is nothing."""
+        """A note for its author, with the remedy; empty if there is nothing to say."""
         if not self.info_left_out:
             return ""
         return (

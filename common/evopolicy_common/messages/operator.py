@@ -128,7 +128,7 @@ class RunResult(msgspec.Struct, frozen=True, kw_only=True):
     wall_s: Named[Number]
     """Seconds by phase: `queue`, `rollout`, `finalise`."""
     record: Plain
-    """What the gateway told when it closed the run (`account.Told`); empty: nothing."""
+    """The gateway's facts when it closed the run (`account.Told`); empty: none."""
 
     @property
     def val_scores(self) -> dict[int, float]:

@@ -63,7 +63,7 @@ class WorkerStatus(msgspec.Struct, frozen=True, kw_only=True):
 
 
 _SHARED = ("tiers", "environments", "fingerprint", "versions", "refused", "classes")
-"""What workers of one installation have in common: most of a status, if there are thousands."""
+"""Fields that workers of one installation share: most of a status, if there are thousands."""
 _LEFT_OUT = {"tiers": (), "environments": (), "fingerprint": "", "versions": {}, "refused": {}, "classes": {}}
 
 

@@ -7,7 +7,7 @@ Rules:
 - Version 2 is used only where it is this process's own: in a cgroup that systemd has delegated
   (`user.delegate`), or at the root of the cgroup namespace. A group with controllers for groups below it may
   not hold processes, so those of the delegated one move to a group `SIBLINGS` below it.
-- What cannot be made is left out: without rights there is no group, and `ControlGroup.held` says what holds.
+- A group that cannot be made is left out, as without rights; `ControlGroup.held` says what holds.
 """
 
 from __future__ import annotations

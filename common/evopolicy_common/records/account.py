@@ -22,7 +22,7 @@ _COUNTED = ("steps", "action_invalid")
 
 
 class Told(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """What a gateway's command knows of its run, and sends when it closes it: fixed from then on."""
+    """A gateway's own facts about its run, which it sends when it closes it: fixed from then on."""
 
     agent: schema.Agent
     """Without `entry` and `prompts`, which the settings decide."""

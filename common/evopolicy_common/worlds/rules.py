@@ -101,11 +101,11 @@ class Rules:
         """By parameter, the number that it is multiplied by; empty if they are unchanged."""
 
     def observe(self, obs: Any) -> Any:
-        """What the policy sees of an observation."""
+        """The observation as the policy sees it."""
         return _apply(self.obs_change, obs)
 
     def act(self, action: Any) -> Any:
-        """What an action of the policy does: an action of the unchanged environment."""
+        """The action of the unchanged environment that the policy's action stands for."""
         return _apply(self.action_change, action)
 
     def _change(self, draws: Draws, space: Space, what: str) -> list[int] | _Vector | None:

@@ -386,7 +386,7 @@ def _has_derived_cases(run: RunRow | None) -> bool:
 
 
 def run_secret(state: Path, key: str) -> bytes:
-    """What the random numbers of a run's policies follow from."""
+    """The secret from which the random numbers of a run's policies follow."""
     return of_run(state, "secret", key)
 
 

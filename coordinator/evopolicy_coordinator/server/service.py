@@ -68,7 +68,7 @@ _CANNOT_WRITE = "the coordinator cannot write its store and accepts no changes u
 _FULL = ("is full", os.strerror(errno.ENOSPC), os.strerror(errno.EDQUOT))
 """Parts of the errors of a full disk, of SQLite and of the system."""
 _ROOM_MB = 64
-"""What a coordinator without large episodes writes in a run, its log ahead of the database included."""
+"""Megabytes that a coordinator writes in a run without large episodes, its log ahead of the database included."""
 
 
 class Pending(NamedTuple):

@@ -2,7 +2,7 @@
 
 Rules that this module owns:
 - The coordinator is asked to disclose the runs' cases before anything of them is read: it refuses while it must.
-- What is collected depends on the runs and the journal alone, and is written in a fixed order: publishing again gives
+- Its content depends on the runs and the journal alone, and is written in a fixed order: publishing again gives
   the same bytes.
 - Every file goes through the searches of `scrub` before it is written. A secret stops the publication, before anything
   is disclosed if it is in a file of a run directory, unless its line is accepted or its file left out.

@@ -294,7 +294,7 @@ def _worlds(run: PublishedRun, history: History) -> Iterator[str]:
 
 
 def _chosen_world(run: PublishedRun) -> str:
-    """What nobody can check of a run's world; empty for no world."""
+    """The parts of a run's world that nobody can check; empty for no world."""
     env, opening = run.opening.settings.env, run.opening
     if worlds.unchanged(env) == env:
         return ""

@@ -22,7 +22,7 @@ _NAMED = 6
 
 
 class Leader(msgspec.Struct, frozen=True, kw_only=True):
-    """Who leads one suite."""
+    """The leader of one suite."""
 
     suite: str
     entry: str
@@ -30,7 +30,7 @@ class Leader(msgspec.Struct, frozen=True, kw_only=True):
     lead: str
     """By how much."""
     apart: str
-    """Who can be told apart from it, and who cannot."""
+    """The entries that can be told apart from it, and those that cannot."""
 
 
 class Answers(msgspec.Struct, frozen=True, kw_only=True):
@@ -38,7 +38,7 @@ class Answers(msgspec.Struct, frozen=True, kw_only=True):
     leaders: tuple[Leader, ...]
     cost: str
     troubles: tuple[str, ...]
-    """What is wrong with the data; empty if nothing is known."""
+    """Faults of the data; empty if none is known."""
 
 
 def answers_of(study: Study) -> Answers:
