@@ -191,7 +191,7 @@ def _environments(runs: Iterable[PastRun]) -> Table:
             common("repeats", "Episodes repeat", "text", repeats, repeated),
         ),
         ordered_environments(by_env),
-        "What was played: cases of a run's hidden splits, and the train episodes that it could spend.",
+        "The cases of a run's hidden splits, and the train episodes that it could spend.",
     )
     return replace(table, columns=(*(each for each in table.columns if each is not version), version))
 

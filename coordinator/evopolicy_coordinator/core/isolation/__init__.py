@@ -4,7 +4,7 @@ docs/explanation/hidden-episodes.md has the rules. `occupancies` says how long a
 lists the occupants of a kernel and says which exclude each other. The folder `agents` has the permits of agents and the
 order of precedence.
 
-The work that may begin on a kernel, for a case set and its relatives. Several states may hold at once; each forbids its part.
+The work that may begin on a kernel, for a case set and its relatives. Several states may hold; each forbids its part.
 
 | state | hidden lease | train lease | permit | ends |
 |---|---|---|---|---|
