@@ -228,8 +228,11 @@ SIGNED_MANIFEST = b"evopolicy manifest 1\0"
 
 
 def signed_by(key: str, signature: str, digest: str) -> bool:
-    """Whether the owner of the public `key` signed the `digest`; False for anything malformed."""
+    """Whether the owner of the public `key` signed the `digest`; False for anything malformed, and for a key in another
+    spelling, which would be another signer."""
     try:
+        if bytes.fromhex(key).hex() != key:
+            return False
         public = Ed25519PublicKey.from_public_bytes(bytes.fromhex(key))
         public.verify(bytes.fromhex(signature), SIGNED_MANIFEST + bytes.fromhex(digest))
     except (InvalidSignature, ValueError):

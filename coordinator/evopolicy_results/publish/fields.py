@@ -33,7 +33,8 @@ _GATEWAY = """
     agent.resources agent.settings versions.agents_md_hash versions.rules_hash versions.initial_policy_hash
 """
 _COORDINATOR = """
-    env_title env_family hidden_isolation outcome.closed_reason timing.queue_s timing.rollout_s timing.finalise_s
+    env_title env_family hidden_isolation outcome.closed_reason outcome.heldout_successes outcome.quarantined_submits
+    timing.queue_s timing.rollout_s timing.finalise_s
     versions.env versions.env_deterministic versions.fingerprint versions.fingerprint_overrides versions.installations
     versions.data_train_hash versions.data_valid_hash versions.data_heldout_hash
 """

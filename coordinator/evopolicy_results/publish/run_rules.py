@@ -97,7 +97,7 @@ def check_run(
 
 def check_starts(checked: Findings) -> None:
     """Adds a finding for each run: whether it starts from another one, and under no weaker conditions than that one."""
-    lines = {run.opening.run: run.record.line for run in checked.runs}
+    by_name = {run.opening.run: run.record for run in checked.runs}
     for run in checked.runs:
         start, name = run.opening.settings.start, run.opening.run
         if start is None:
@@ -105,7 +105,12 @@ def check_starts(checked: Findings) -> None:
             continue
         text = f"it starts from {start.text}: that run's work and budget are in its policies and its score"
         checked.add("starts", "open", text, name)
-        least = start.line.weakest(lines.get(start.run, start.line))
+        if (parent := by_name.get(start.run)) is None:
+            continue
+        if parent.trees.get(str(start.submit_index), start.tree) != start.tree:
+            text = f"its start has another workspace than {start.text}"
+            checked.add("commitment", "failed", text, name)
+        least = start.line.weakest(parent.line)
         for condition in Line.__struct_fields__:
             told, fixed = getattr(start.line, condition), getattr(least, condition)
             if told not in ("unknown", fixed):
@@ -127,8 +132,12 @@ def _commitment(run: PublishedRun, history: History) -> Iterator[str | Flaw]:
     names = ("entry", "model", "env", "exp_id", "repeat", "attempt", "start")
     if entry.epoch != opening.epoch or any(getattr(entry, name) != getattr(settings, name) for name in names):
         yield "the journal opened it for another entry, environment, experiment, epoch or start"
-    if entry.start is not None and history.entry(Opened, entry.start.run) is None:
-        yield Flaw("journal", f"it starts from run {entry.start.run}, of which the journal has no entry")
+    if entry.start is not None:
+        before = history.entry(Opened, entry.start.run)
+        if before is None:
+            yield Flaw("journal", f"it starts from run {entry.start.run}, of which the journal has no entry")
+        elif before[0] >= number:
+            yield Flaw("journal", f"it starts from run {entry.start.run}, which was not opened before it")
     fixed = (entry.commitment, number, history.heads[number], entry.epoch)
     if place is None or (place.commitment, place.opened, place.opened_head, place.epoch) != fixed:
         yield Flaw("record", "run.json has another commitment or head of the journal than the journal has")
@@ -179,7 +188,9 @@ def _record(run: PublishedRun, history: History) -> Iterator[str | Flaw]:
         settings=opening.settings,
         error=None,
         agent={},
-        fingerprint_overrides=("left out",) * result.n_overrides,
+        # No more than make a difference: the number is the file's.
+        fingerprint_overrides=("left out",)
+        * min(result.n_overrides, 1 + len(record.versions.fingerprint_overrides)),
         budget=opening.budget,
         min_episodes_per_submit=opening.min_episodes_per_submit,
         max_episodes_per_submit=opening.max_episodes_per_submit,
@@ -224,13 +235,19 @@ def _selection(run: PublishedRun, history: History) -> Iterator[str]:
     eligible = {
         submit.submit_index: submit.val_mean
         for submit in result.submits
-        if submit.status == "ok"
-        and submit.val_mean is not None
-        and submit.submit_index not in result.validation_ineligible
+        if submit.status == "ok" and submit.val_mean is not None
     }
+    if result.status not in ("completed", "no_ok_submit"):
+        return
     wanted = best_validated(eligible, run.opening.settings.profile)
-    if result.status == "completed" and result.best_submit_index != wanted:
+    if result.best_submit_index != wanted:
         yield f"submit {result.best_submit_index} is recorded as selected, submit {wanted} has the best validation mean"
+    ineligible = [one.submit_index for one in result.submits if one.status == "ok" and one.val_mean is None]
+    if ineligible != sorted(result.validation_ineligible):
+        told = list(result.validation_ineligible)
+        yield f"submits {ineligible} have no validation mean, {told} are recorded as ineligible"
+    elif ineligible and run.opening.settings.failed_episodes != "end-submit":
+        yield f"submits {ineligible} are recorded as ineligible, which the settings do not allow"
 
 
 def _scores(run: PublishedRun, history: History) -> Iterator[str]:
@@ -418,8 +435,8 @@ def _metrics(run: PublishedRun, policies: dict[int, Bundle], checked: Findings) 
     by_submit = run.record.outcome.auxiliary.get(_BY_SUBMIT, {})
     file = f"{run.folder}/{contents.RUN}"
     wanted = [str(submit.submit_index) for submit in run.result.submits]
-    pairs: list[tuple[str, object, object]] = [(_BY_SUBMIT, list(by_submit), wanted)]
     try:
+        pairs: list[tuple[str, object, object]] = [(_BY_SUBMIT, list(by_submit), wanted)]
         for index, here in by_submit.items():
             where = f"outcome.auxiliary.{_BY_SUBMIT}.{index}"
             if (policy := policies.get(int(index))) is None:

@@ -76,6 +76,24 @@ def replay_entry(lines: list[bytes]) -> list[bytes]:
     return [lines[0].replace(b'"replay_of":""', b'"replay_of":"r-1"'), *lines[1:]]
 
 
+def start_from_itself(forger: Forger) -> None:
+    run = json.loads(forger.files[OPENING])["run"]
+    lines = contents.journal_entries(forger.files[contents.JOURNAL])
+    entries = [json.loads(line) for line in lines]
+    for each in entries:
+        if each["kind"] == "opened" and each["run"] == run:
+            each["start"] = {**START, "run": run}
+    forger.entries(lambda _: [spelt(contents.JOURNAL, each) for each in entries])
+
+
+def call_ineligible(forger: Forger) -> None:
+    """The submit with the best validation, so that its publisher may select by held-out returns."""
+    result = json.loads(forger.files[RESULT])
+    best = result["best_submit_index"]
+    result["submits"][best]["val_mean"] = None
+    forger.put(RESULT, result | {"validation_ineligible": [best], "best_submit_index": 1 - best})
+
+
 def better_result(forger: Forger) -> None:
     """All that the forger can raise consistently."""
     for name, path in ((RESULT, ("heldout_returns",)), (RUN, ("outcome", "heldout_returns"))):
@@ -112,7 +130,12 @@ SIGNED_ANEW: dict[str, tuple[Edit, str, str]] = {
     "a smaller spread": (lambda f: f.json(RUN, put("outcome", "heldout_std_return", value=0.001)), "record", "heldout_std_return"),
     "a weaker random reference": (lambda f: f.json(RUN, put("outcome", "random_reference", "mean_return", value=-1e6)), "record", "random_reference.mean_return"),
     "a validation mean edited": (lambda f: f.json(RUN, put("outcome", "val_scores", "0", value=1e6)), "record", "val_scores"),
+    "metrics of code that are none": (lambda f: f.json(RUN, put("outcome", "auxiliary", "code_metrics_by_submit", value=None)), "record", "metrics of code in another form"),
+    "overrides without end": (lambda f: f.json(RESULT, put("n_overrides", value=2**62)), "record", "fingerprint_overrides"),
     "another selected checkpoint": (lambda f: f.json(RESULT, lambda summary: put("best_submit_index", value=1 - summary["best_submit_index"])(summary)), "selection", "has the best validation mean"),
+    "the best submit called ineligible": (call_ineligible, "selection", "which the settings do not allow"),
+    "the best submit without a validation": (lambda f: f.json(RESULT, put("submits", 1, "val_mean", value=None)), "selection", "[] are recorded as ineligible"),
+    "a scored run called one without an ok submit": (lambda f: f.json(RESULT, lambda summary: summary.update(status="no_ok_submit", best_submit_index=None)), "selection", "has the best validation mean"),
     "reordered submits": (lambda f: f.json(RESULT, lambda summary: summary["submits"].reverse()), "budget", "not in order"),
     "a submit left out": (lambda f: f.json(RESULT, lambda summary: summary["submits"].pop() and None), "budget", "episodes"),
     "a submit of more episodes than granted": (lambda f: f.json(RESULT, lambda summary: summary["submits"][0]["env_instances"].extend([0] * 9)), "budget", "were granted"),
@@ -123,6 +146,7 @@ SIGNED_ANEW: dict[str, tuple[Edit, str, str]] = {
     "another repeat": (lambda f: f.json(RUN, put("repeat", value=5)), "record", "repeat"),
     "a start that it did not have": (lambda f: f.json(RUN, lambda record: {**record, "start": START}), "record", "start"),
     "a start in the opening too": (lambda f: f.json(OPENING, put("settings", "start", value=START)), "commitment", "not those that were committed to"),
+    "a start from itself": (start_from_itself, "journal", "was not opened before it"),
     "a tree that was not recorded": (lambda f: f.json(RUN, put("trees", "0", value="ab" * 32)), "record", "trees"),
     "a replay, by its record": (lambda f: f.json(RUN, put("replay_of", value="r-1")), "record", "replay_of"),
     "a replay, by its opening": (lambda f: f.json(OPENING, put("settings", "replay_of", value="r-1")), "commitment", "is a replay of run r-1"),
@@ -157,6 +181,7 @@ NOT_SIGNED_ANEW: dict[str, tuple[Edit, str, str]] = {
     "an edited manifest": (lambda f: f.text(contents.MANIFEST, b'"software":"', b'"software":"9'), "signature", "not a signature"),
     "a manifest with a field twice": (lambda f: f.text(contents.MANIFEST, b"{", b'{"version":1,'), "format", "a key occurs twice"),
     "a signature that is none": (lambda f: f.json(contents.SIGNATURE, put("signature", value="zz")), "signature", "not a signature"),
+    "a key in another spelling": (lambda f: f.json(contents.SIGNATURE, lambda told: told.update(key=f" {told['key'].upper()}")), "signature", "not a signature"),
     "no signature": (lambda f: f.files.pop(contents.SIGNATURE) and None, "format", "signature.json is missing"),
     "a later format": (lambda f: f.json(contents.MANIFEST, put("version", value=2)), "format", "reads 'evopolicy results' version 1"),
     "a journal that is cut": (lambda f: f.entries(lambda lines: lines[:-1]), "journal", "not the signed one"),

@@ -113,7 +113,7 @@ def drop(document: Any, *names: str) -> None:
     document["start"] = None
 
 
-@pytest.mark.parametrize("how", ["journal", "opening", "record", "conditions", "parent's entry"])
+@pytest.mark.parametrize("how", ["journal", "opening", "record", "conditions", "workspace", "parent's entry"])
 def test_a_start_that_is_denied_is_found(published: Path, how: str) -> None:
     name = next(
         name
@@ -136,6 +136,12 @@ def test_a_start_that_is_denied_is_found(published: Path, how: str) -> None:
                 f"{name}/{contents.OPENING}", lambda opening: opening["settings"]["start"].update(line=line)
             )
             text = "its start records jail 'bwrap' of the runs before"
+        case "workspace":
+            forger.json(
+                f"{name}/{contents.OPENING}",
+                lambda opening: opening["settings"]["start"].update(tree="ab" * 32),
+            )
+            text = "another workspace than submit 0 of"
         case _:
             forger.entries(lambda lines: [line for line in lines if b'"entry":"explorer"' not in line])
             kind, text = "journal", "of which the journal has no entry"

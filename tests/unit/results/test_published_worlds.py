@@ -74,5 +74,6 @@ def test_model_tokens_jail_and_isolation_are_listed_as_the_publishers_word() -> 
         "agent.model_use",
         "jail",
         "hidden_isolation",
+        "outcome.heldout_successes",
     )
     assert set(named) <= set(fields.TOLD)
