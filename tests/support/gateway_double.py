@@ -37,6 +37,7 @@ from evopolicy_common.records.policies.bundles import BundleFile
 from evopolicy_common.wire import codec, credentials, keys, transport
 from evopolicy_common.wire.credentials import Credentials
 from evopolicy_coordinator.core.contract.settings import CoreSettings
+from evopolicy_gateway.cli.serve import progress_of
 from evopolicy_gateway.processes import child_messages
 from evopolicy_gateway.run.gateway import Gateway
 from evopolicy_gateway.run_folder.layout import RunFolder
@@ -477,7 +478,8 @@ class Served(msgspec.Struct, frozen=True):
 
     waits: list[str]
     """The reasons for waiting that it has reported."""
-
+    progress: list[child_messages.TrainProgress]
+    """All that it has reported."""
     double: Double
     folder: RunFolder
     gateway: Gateway
@@ -505,11 +507,12 @@ class Served(msgspec.Struct, frozen=True):
 async def gateway_on(folder: RunFolder, double: Double) -> AsyncIterator[Served]:
     """A gateway on that folder; stopped without closing the run at the end, if it still serves."""
     waits: list[str] = []
+    progress: list[child_messages.TrainProgress] = []
     ready: asyncio.Future[tuple[Urls, SubmitPipeline]] = asyncio.get_running_loop().create_future()
     gateway = Gateway(
         folder,
         on_ready=lambda urls, pipeline: ready.set_result((urls, pipeline)),
-        on_change=lambda pipeline: None,
+        on_change=lambda pipeline: progress.append(progress_of(pipeline.machine)),
         on_wait=waits.append,
     )
     task = asyncio.create_task(gateway.run())
@@ -518,7 +521,7 @@ async def gateway_on(folder: RunFolder, double: Double) -> AsyncIterator[Served]
         task.result()
     urls, pipeline = ready.result()
     async with httpx.AsyncClient(timeout=30.0, trust_env=False) as client:
-        yield Served(waits, double, folder, gateway, task, urls, pipeline, client)
+        yield Served(waits, progress, double, folder, gateway, task, urls, pipeline, client)
     gateway.tell(None)
     await task
 

@@ -139,10 +139,15 @@ class Gateway:
                 self._on_change(pipeline)
             if self._orders.done():
                 return self._orders.result()
-            # At once: after its last submit an agent may end at any moment, and the reason counts that comes first.
-            over = asyncio.ensure_future(pipeline.until(lambda: machine.spent or machine.cancelled))
-            await asyncio.wait([over, *ends], timeout=_REPORT_S, return_when=asyncio.FIRST_COMPLETED)
-            over.cancel()
+
+            # Each verdict at once, as a report has only the last one. After its last submit an agent may end at any
+            # moment, and the reason counts that comes first.
+            def is_news(reported: int = machine.n_settled) -> bool:
+                return machine.n_settled > reported or machine.spent or machine.cancelled
+
+            urgent = asyncio.ensure_future(pipeline.until(is_news))
+            await asyncio.wait([urgent, *ends], timeout=_REPORT_S, return_when=asyncio.FIRST_COMPLETED)
+            urgent.cancel()
 
     async def _close(self, pipeline: SubmitPipeline, close: CloseGateway) -> bool:
         await asyncio.to_thread(save, self._folder.closing, close)

@@ -134,6 +134,7 @@ class TicketMachine:
         self.in_flight: Ticket | None = None
         self.tickets: list[Ticket] = []
         """Accepted submits by index, followed by at most one that is not accepted yet."""
+        self.n_settled = 0
         self.n_rejected = 0
         self.in_flight_s = 0.0
         """Seconds in which a submit was in flight, in this process."""
@@ -319,6 +320,7 @@ class TicketMachine:
         ticket.policy_failures, ticket.warning = summary.get("policy_failures"), summary.get("warning")
         ticket.status, ticket.place, ticket.waits_for = entry.status, place, ""
         ticket.n_done = ticket.n_episodes
+        self.n_settled += 1
         # To save memory: a run has thousands of episodes.
         submit = msgspec.structs.replace(ticket.request.submit, env_instances=())
         ticket.request = msgspec.structs.replace(ticket.request, submit=submit)

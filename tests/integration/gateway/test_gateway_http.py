@@ -265,3 +265,13 @@ async def test_the_service_listens_on_loopback_only(tmp_path: Path) -> None:
         with socket.socket() as probe:
             probe.settimeout(2)
             assert probe.connect_ex(("127.0.0.2", port)) != 0
+
+
+async def test_each_of_quick_submits_is_reported_with_its_budget(tmp_path: Path) -> None:
+    async with served(tmp_path) as service:
+        for case in range(4):
+            await service.submit([case])
+    first: dict[str | None, int] = {}
+    for progress in service.progress:
+        first.setdefault(progress.last_submit_id, progress.remaining_budget)
+    assert [*first.values()] == [12, 11, 10, 9, 8]
