@@ -13,6 +13,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import msgspec
+
+from evopolicy_common.messages.run_settings import AllConditions
 from evopolicy_common.processes.left_files import left_files
 from evopolicy_common.regular_files import MAX_BYTES, read_regular
 
@@ -50,6 +53,11 @@ EXCLUDED_FIELDS: Mapping[str, Mapping[str, str]] = {
     "error.txt": {"timestamp": "a time"},
 }
 """Fields that are not compared, by the name of their file, with the reason. The text files hold JSON lines."""
+
+_USUAL = {
+    f"experiment_dimensions.{field.name}": field.default for field in msgspec.structs.fields(AllConditions)
+}
+"""By path in `run.json`, the value of a condition in runs of versions that did not have it."""
 
 MAX_PARSED_BYTES = MAX_BYTES
 """Files above this size (bytes) were written by an agent, whatever their names, and are compared as plain bytes."""
@@ -105,11 +113,13 @@ def _file_differences(name: str, left: Path, right: Path) -> list[str]:
     excluded = tuple(EXCLUDED_FIELDS[file])
     try:
         ours, theirs = (_parse(name, read_regular(path)) for path in (left, right))
+        usual = _USUAL if name == "run.json" else {}
         return [
             f"{name}: {path or 'content'}: {_short(a)} and {_short(b)}"
             for path, a, b in _value_differences("", ours, theirs)
             if not any(path == each or path.startswith(f"{each}.") for each in excluded)
             and path.rpartition(".")[2] not in (excluded if name.endswith(".txt") else ())
+            and not (path in usual and (a, b) in ((..., usual[path]), (usual[path], ...)))
         ]
     except (ValueError, TypeError, AttributeError) as error:
         return [f"{name}: cannot be read: {error}"]

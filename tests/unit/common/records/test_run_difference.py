@@ -6,6 +6,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+import pytest
 from typer.testing import CliRunner
 
 from evopolicy_common.records.run_difference import differences
@@ -85,6 +86,16 @@ def test_other_isolation_and_hidden_cases_make_a_difference(tmp_path: Path) -> N
 def test_a_field_that_is_missing_is_a_difference(tmp_path: Path) -> None:
     found = differences(make_run(tmp_path, "a", extra=1), make_run(tmp_path, "b"))
     assert found == ["workspace/feedback/submit_000/summary.json: extra: 1 and nothing"]
+
+
+@pytest.mark.parametrize(("cases", "differ"), [("shared", False), ("per_run", True)])
+def test_a_missing_condition_counts_as_its_default(tmp_path: Path, cases: str, differ: bool) -> None:
+    left, right = pair(tmp_path)
+    for folder, dimensions in ((left, {"n_train": 64}), (right, {"n_train": 64, "hidden_cases": cases})):
+        record = json.loads((folder / "run.json").read_text()) | {"experiment_dimensions": dimensions}
+        (folder / "run.json").write_text(json.dumps(record))
+    expected = ['run.json: experiment_dimensions.hidden_cases: nothing and "per_run"'] if differ else []
+    assert differences(left, right) == expected
 
 
 def test_json_without_end_of_nesting_is_a_difference_and_no_crash(tmp_path: Path) -> None:
