@@ -12,6 +12,7 @@ from played import DATA
 from published_checker import check_run
 
 pytestmark = pytest.mark.timeout(600)
+REMEDY = "on purpose: PYTHONPATH=tests/support python tests/conformance/protocol/golden_artifacts.py"
 NAMES = sorted(path.name for path in GOLDEN.iterdir())
 
 
@@ -22,11 +23,11 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.parametrize("name", NAMES)
 def test_artifact_is_what_its_golden_file_says(run: Path, name: str) -> None:
-    assert artifacts(run)[name] == (GOLDEN / name).read_text()
+    assert artifacts(run)[name] == (GOLDEN / name).read_text(), REMEDY
 
 
 def test_every_artifact_has_a_golden_file(run: Path) -> None:
-    assert sorted(artifacts(run)) == NAMES
+    assert sorted(artifacts(run)) == NAMES, REMEDY
     assert check_run(run) == []
 
 

@@ -119,7 +119,8 @@ def test_every_argument_has_its_rule() -> None:
 def test_keywords_for_type_checkers_are_the_declared_options() -> None:
     paths = {Path: _arguments.AnyPath, ResourceLimits: Mapping[str, float] | None}
     given = typing.get_type_hints(evp.RunKeywords)
-    assert [*given] == [name for name in _arguments.OPTIONS if name != "agent"]
+    wanted = [name for name in _arguments.OPTIONS if name != "agent"]
+    assert [*given] == wanted, "RunKeywords in evopolicy/_arguments.py has the fields of RunOptions, in order"
     for name, kind in given.items():
         declared = _arguments.OPTIONS[name].type
         optional = type(None) in typing.get_args(declared)
