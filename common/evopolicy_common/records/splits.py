@@ -61,7 +61,8 @@ def read_split_file(path: Path) -> tuple[SplitFile, str]:
     data = read_given(path, f"split file {path}")
     try:
         content = msgspec.json.decode(data, type=SplitFile)
-    except (msgspec.DecodeError, RecursionError, UnicodeDecodeError) as error:
+        msgspec.msgpack.encode(content.cases)  # as they are stored: without integers of more than 64 bits
+    except (msgspec.DecodeError, OverflowError, RecursionError, UnicodeDecodeError) as error:
         raise ConfigError(f"{path} is not a split file: {error}") from error
     for number, case in enumerate(content.cases):
         if not 0 <= case.seed < SEED_LIMIT:

@@ -204,6 +204,8 @@ class Bad(Glider):
             reward = np.ones(3)
         elif self.how == "ends of several":
             terminated = np.array([True, False])
+        elif self.how == "an end in a list":
+            truncated = [False]
         elif self.how == "info of several":
             info = [info]
         elif self.how == "text observation":

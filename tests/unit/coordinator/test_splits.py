@@ -122,6 +122,12 @@ def test_files_that_do_not_say_they_are_secret_are_not(folder: Path) -> None:
         ("valid", [-1], {}, "case 0 has seed -1"),
         ("valid", [], {"cases": [{"seed": "x"}]}, r"not a split file.*\$\.cases\[0\]\.seed"),
         ("valid", [], {"cases": None}, "not a split file"),
+        (
+            "valid",
+            [],
+            {"cases": [{"seed": 4, "options": {"a": 2**64}}]},
+            "valid.json is not a split file: .*ints",
+        ),
         ("train", [1], {"cases": [{"seed": 6, "options": {}}]}, "seed 6 is train case 0 and heldout case 0"),
     ],
 )

@@ -250,6 +250,8 @@ def _enc_hook(value: object) -> Any:
         _check_shape(value.shape)
         head = [value.dtype.str, list(value.shape), value.tobytes()]
         return msgspec.msgpack.Ext(_EXT_ARRAY, encoder.encode(head))
+    if isinstance(value, np.longdouble | np.clongdouble):  # of which `tolist` makes no number of Python's
+        return float(value.real)
     if isinstance(value, np.generic | np.ndarray):
         return value.tolist()
     return str(value)

@@ -163,6 +163,7 @@ def test_what_msgpack_cannot_say_is_kept_readable() -> None:
     )
     assert rows[0].action == "\\ud800"
     assert rows[1].action == {"\\ud800": 2**70}
+    assert [row.action for row in round_trip([(0, np.longdouble(0.5), 0.0, True, False, {})]).rows()] == [0.5]
 
 
 def test_an_episode_without_a_step_is_an_episode() -> None:

@@ -27,7 +27,9 @@ def test_short_arrays_lists_and_flat_dicts_are_kept_and_longer_ones_dropped() ->
     kept = plain_info({"r": {"x": np.True_, "y": 2.0}, "nested": {"x": {"y": 1}}})
     assert kept == {"r": {"x": True, "y": 2.0}}
     assert plain_info({"text": "x" * 257, "big": 2**64, "object": object(), "none": None}) == {}
-    assert plain_info({"strings": np.array(["a"]), "objects": np.array([None])}) == {}
+    odd = {"long": np.zeros(2, np.longdouble), "\ud800": 1.0, "pairs": {"\ud800": 1.0}}
+    assert plain_info({"strings": np.array(["a"]), "objects": np.array([None]), **odd}) == {"pairs": {}}
+    assert plain_info({"bytes": "a\udcff"}) == {"bytes": "a\ufffd"}
 
 
 def test_nothing_that_names_a_seed_passes() -> None:

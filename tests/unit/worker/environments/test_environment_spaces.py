@@ -92,6 +92,7 @@ def test_bounds_of_a_picture_are_those_of_its_bytes() -> None:
 def test_bounds_of_a_schema_of_an_older_version_are_read() -> None:
     low, high = bounds({"type": "Box", "shape": [40], "dtype": "float64", "low": "-inf", "high": 1.0})
     assert (low.shape, low.max(), high.min()) == ((40,), -np.inf, 1.0)
+    assert bounds(to_schema(spaces.Box(0, 1, (3, 0, 2))))[0].shape == (3, 0, 2)
 
 
 class Quaternion(spaces.Space[Any]):
@@ -138,6 +139,16 @@ def test_a_transposed_picture_becomes_contiguous_and_its_own() -> None:
     assert obs.flags.c_contiguous
     assert obs.tobytes() == picture.transpose(1, 0, 2).tobytes()
     assert not np.shares_memory(obs, picture)
+
+
+def test_a_text_that_no_file_can_hold_becomes_another() -> None:
+    observe = compile_observation({"type": "Text", "min_length": 0, "max_length": 9})
+    assert [observe(each) for each in ("a", "é\U0001f600", "a\udcff")] == ["a", "é\U0001f600", "a\ufffd"]
+
+
+def test_a_choice_before_the_first_is_refused() -> None:
+    with pytest.raises(LookupError):
+        compile_observation({"type": "OneOf", "spaces": [{"type": "Discrete", "n": 2}]})((-1, 0))
 
 
 def test_an_unknown_kind_of_observation_is_refused() -> None:

@@ -90,6 +90,7 @@ BAD = {
     "object reward": r"step 0, reward: it is <object .* \(object\); a reward has to be one number, or its",
     "reward of several": r"step 0, reward: it is array\(\[1., 1., 1.\]\).*be named in reward_vector",
     "ends of several": r"step 0, terminated: it is array.*it has to be true or false",
+    "an end in a list": r"step 0, truncated: it is \[False\] \(list\); it has to be true or false",
     "info of several": r"step 0, info: it is \[\{'near'.* \(list\); it has to be a dict",
     "text observation": r"step 0, observation: it is 'a hill\\nto the left' \(str\), and cannot be read as",
     "no observation": r"step 0, observation: an array of shape \(\), not \(2,\)",
@@ -126,6 +127,11 @@ REFUSED: list[tuple[str, dict[str, Any], str]] = [
         "Glider",
         {"gymnasium_id": "broken_on_import:Thing-v0"},
         MADE + ".*raised RuntimeError: half a build; correct its gymnasium_id, or",
+    ),
+    (
+        "Glider",
+        {"title": "\ud800"},
+        "make: its spaces and texts cannot be sent .*; let them have valid Unicode",
     ),
     (
         "Bad",

@@ -17,6 +17,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+import msgspec
 import numpy as np
 
 from evopolicy_common.catalogue import MAX_STEPS, USUAL_STEPS, Entry, Wrapper, is_shipped
@@ -304,6 +305,13 @@ class GymnasiumEnvironment(Environment):
             adapter=adapter(type(family), family.revision, entry.gymnasium_id or ""),
             packages=family.packages(entry),
         )
+        try:
+            msgspec.msgpack.encode(self.description)
+        except (TypeError, ValueError, OverflowError) as error:
+            raise WorkerError(
+                f"{call}: its spaces and texts cannot be sent ({described(error)}); let them have valid Unicode and"
+                " numbers of 64 bits at most"
+            ) from error
         call.done()
 
     def alter(self, factors: dict[str, float]) -> None:
@@ -367,7 +375,7 @@ class GymnasiumEnvironment(Environment):
             fault = trial.misshapen(returned, error, vector=self._rewards is not None)
             raise WorkerError(f"{call}, {fault}") from error
         if self._promises is not None:
-            self._promises.after_step(step, obs, reward)
+            self._promises.after_step(step, obs, reward, *returned[2:4])
         call.done()
         return step
 

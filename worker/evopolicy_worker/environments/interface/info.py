@@ -14,6 +14,8 @@ from typing import Any
 
 import numpy as np
 
+from evopolicy_worker.environments.interface.spaces import as_text
+
 MAX_ELEMENTS = 16
 """Longer arrays, lists and nested dicts are dropped."""
 MAX_CHARACTERS = 256
@@ -46,9 +48,10 @@ def plain_info(info: Mapping[Any, Any]) -> dict[str, Any]:
 def _compound(value: Any) -> Any:
     """A short string, list or dict as plain values; None when it is not kept."""
     if isinstance(value, str):
-        return str(value) if len(value) <= MAX_CHARACTERS else None
+        return as_text(value) if len(value) <= MAX_CHARACTERS else None
     if isinstance(value, np.ndarray):
-        return value.tolist() if value.size <= MAX_ELEMENTS and value.dtype.kind in "biuf" else None
+        is_plain = value.dtype.kind in "biuf" and value.dtype != np.longdouble
+        return value.tolist() if value.size <= MAX_ELEMENTS and is_plain else None
     if isinstance(value, Mapping):
         flat = {key: _scalar(item) for key, item in value.items() if _may_name(key)}
         return flat if len(flat) <= MAX_ELEMENTS and None not in flat.values() else None
@@ -65,4 +68,4 @@ def _scalar(value: Any) -> Any:
 
 @lru_cache(maxsize=4096)
 def _may_name(key: Any) -> bool:
-    return isinstance(key, str) and "seed" not in key.lower()
+    return isinstance(key, str) and "seed" not in key.lower() and as_text(key) == key

@@ -244,7 +244,15 @@ def _plain(value: Any) -> Any:
 
 def _filled(value: Any, shape: tuple[int, ...]) -> NDArray[np.float64]:
     """The numbers of a schema, one for all or nested lists, with "inf" among them."""
+    if 0 in shape:  # of which nested lists do not tell all lengths
+        return np.zeros(shape)
     return np.array(np.broadcast_to(np.array(value, dtype=np.float64), shape))
+
+
+def as_text(value: object) -> str:
+    """The value as text. Half a surrogate pair, as undecoded bytes give, becomes U+FFFD: no file can hold it."""
+    text = str(value)
+    return text if text.isascii() else text.encode("utf-16", "surrogatepass").decode("utf-16", "replace")
 
 
 Converter = Callable[[Any], Any]
@@ -265,7 +273,7 @@ def compile_observation(schema: SpaceSchema) -> Converter:
         # A transposed image keeps its layout by default, and would be sent with swapped axes.
         return lambda raw: array(raw, dtype=dtype, order="C")
     if kind in ("Discrete", "Text"):
-        return int if kind == "Discrete" else str
+        return int if kind == "Discrete" else as_text
     if kind == "Sequence":
         if schema["stacked"]:
             return _rows(schema["space"])
@@ -280,7 +288,8 @@ def compile_observation(schema: SpaceSchema) -> Converter:
     if kind == "Tuple":
         return lambda raw: tuple(part(value) for part, value in zip(inner, raw, strict=True))
     if kind == "OneOf":
-        return lambda raw: (int(raw[0]), inner[int(raw[0])](raw[1]))
+        choices = dict(enumerate(inner))  # a list has negative places too
+        return lambda raw: (int(raw[0]), choices[int(raw[0])](raw[1]))
     raise TypeError(f"no observations for a space of type {kind!r}")
 
 

@@ -60,10 +60,13 @@ class Promises:
             )
         self._check_spaces()
 
-    def after_step(self, step: Step, raw: Any, reward: Any) -> None:
-        """`raw`, `reward`: as the environment gave them."""
+    def after_step(self, step: Step, raw: Any, reward: Any, *ends: Any) -> None:
+        """`raw`, `reward`, `ends`: as the environment gave them."""
         if isinstance(reward, str | bytes):  # of which `float` makes a number, too
             raise WorkerError(f"{call}, reward: it is {_shown(reward)}; a reward has to be one number")
+        for name, end in zip(("terminated", "truncated"), ends, strict=True):
+            if isinstance(end, str | bytes | list | tuple | Mapping):  # true, unless empty
+                raise WorkerError(f"{call}, {name}: it is {_shown(end)}; it has to be true or false")
         if not math.isfinite(step.reward):
             raise WorkerError(f"{call}, reward: it is {step.reward}; rewards have to be finite")
         self.observation(step.obs, raw)
