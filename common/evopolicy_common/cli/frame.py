@@ -207,4 +207,10 @@ def _usage_text(error: TyperException) -> str:
         )
     text = " ".join(str(error.format_message()).split()).replace("Value error, ", "") or "wrong usage"
     context = getattr(error, "ctx", None)
-    return text if context is None else f"{text.rstrip('.')}; see {context.command_path} --help"
+    if context is None:
+        return text
+    name = getattr(error, "option_name", "").lstrip("-").replace("-", "_")
+    settings = next((each.help for each in context.command.params if "--set" in each.opts), "")
+    if name and re.search(rf"\b{re.escape(name)}\b", settings):
+        return f"{text.rstrip('.')}; give it as --set {name}=VALUE"
+    return f"{text.rstrip('.')}; see {context.command_path} --help"
