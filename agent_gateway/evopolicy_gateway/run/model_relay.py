@@ -24,6 +24,7 @@ from evopolicy_common.errors import EvopolicyError
 from evopolicy_common.messages.operator import CreateRun
 from evopolicy_common.processes.preflight import LOOPBACK
 from evopolicy_common.records.secrets import Redaction, without_keys
+from evopolicy_common.terminal import counted
 from evopolicy_common.wire.http import bound
 from evopolicy_gateway.agent_supervisor.supervisor import secrets_in
 from evopolicy_gateway.http.server import Address
@@ -97,7 +98,8 @@ class ModelRelay(RestartedChild):
         plan, used = self._run.plan, read_ledger(self._run.folder.model_requests)
         config = plan.known_config
         tokens = used.recorded(None if config is None else config.prices)
-        self._run.note(f"model use: {used.requests:,} requests ({used.failed:,} failed), {use_words(tokens)}")
+        n = counted(used.requests, "request")
+        self._run.note(f"model use: {n} ({used.failed:,} failed), {use_words(tokens)}")
 
 
 def use_words(tokens: Mapping[str, object]) -> str:

@@ -161,7 +161,9 @@ class Conversation:
         except Exception as error:
             # An answer that is none of this API leaves the libraries as errors of any kind.
             text = str(error).partition("\n")[0]
-            raise ApiError(f"the model's answer cannot be read: {type(error).__name__}: {text}") from error
+            if isinstance(error, AttributeError | LookupError | TypeError):
+                text = "it lacks parts that answers of this API have"
+            raise ApiError(f"the model's answer cannot be read: {text}") from error
         made = []
         for n, part in enumerate(_parts([response], ToolCallPart)):
             part.__class__ = _AsSent
