@@ -66,3 +66,9 @@ def test_an_environment_without_a_policy_is_told_and_not_accepted(tmp_path: Path
     assert played.returncode == 0, played.stderr
     assert "no policy is known, so no world is accepted" in played.stdout
     assert [type(each) for each in worlds.read_journal(tmp_path / "state" / JOURNAL)] == [Base]
+
+
+def test_nothing_is_tried_without_a_folder_of_policies(tmp_path: Path) -> None:
+    refused = accept(tmp_path, "gym/continuouscar")
+    assert (refused.returncode, [*tmp_path.iterdir()]) == (2, [])
+    assert "--policies" in refused.stderr

@@ -47,7 +47,12 @@ def accept_worlds(
         typer.Argument(metavar="[ENV]...", help="Environments of Core16, or globs. Default: all of them."),
     ] = None,
     policies: Annotated[
-        Path, typer.Option(help="Folder with a folder of canonical policies for each environment.")
+        Path,
+        typer.Option(
+            exists=True,
+            file_okay=False,
+            help="Folder with a folder of canonical policies for each environment.",
+        ),
     ] = Path("examples/policies"),
     state: State = None,
 ) -> None:
