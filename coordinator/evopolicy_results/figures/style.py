@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any
@@ -98,7 +99,9 @@ def drawn(plot: Plot) -> Plot:
 def svg_text(figure: Figure, name: str) -> str:
     """The figure as a stand-alone SVG: text as text, transparent background, deterministic bytes."""
     out = io.StringIO()
-    with matplotlib.rc_context({**RC, "svg.hashsalt": name}):
+    with warnings.catch_warnings(), matplotlib.rc_context({**RC, "svg.hashsalt": name}):
+        # The reader's fonts draw the text; the warning would print characters of names as they are.
+        warnings.filterwarnings("ignore", "Glyph", UserWarning)
         engine = figure.get_layout_engine()
         if engine is not None:
             engine.execute(figure)

@@ -103,6 +103,15 @@ def test_wilson_interval_is_the_published_one() -> None:
     assert wilson(5, 5)[1] == 1.0
 
 
+@pytest.mark.filterwarnings("error")
+def test_a_name_without_glyphs_is_drawn_without_a_warning() -> None:
+    with new_figure(2.0, 1.0) as (figure, axes):
+        axes[0][0].set_title("模型甲\x1b[31m")
+    svg = svg_text(figure, "a")
+    assert "模型甲" in svg
+    assert "\x1b" not in svg
+
+
 def test_inline_svg_is_themed_named_and_has_ids_of_its_own() -> None:
     with new_figure(2.0, 1.0) as (figure, axes):
         axes[0][0].plot([0, 1], [0, 1])
