@@ -27,6 +27,8 @@ LEAST_CASES = 5
 """With fewer cases no method reaches its coverage."""
 RELATIVE_ZERO = 1e-9
 """Relative bound: a smaller spread is rounding error."""
+_CANCELLED = 1e-13
+"""A smaller variance of values with variance 1, as a difference of squares, is rounding error."""
 
 Method = Literal["bootstrap-t", "adjusted Wald", "score", "crossed t", "Welch t", "stratified t", "none"]
 Over = Literal["cases", "runs and cases", "runs", "worlds, runs, and cases", "nothing"]
@@ -111,7 +113,7 @@ def _bootstrap_t(values: Floats, resamples: int) -> float:
     means = drawn @ scaled
     variances = np.maximum(0.0, drawn @ scaled**2 - means**2) / (n - 1)
     with np.errstate(divide="ignore", invalid="ignore"):
-        t = np.where(variances > RELATIVE_ZERO**2, np.abs(means) / np.sqrt(variances), np.inf)
+        t = np.where(variances > _CANCELLED, np.abs(means) / np.sqrt(variances), np.inf)
     return float(np.quantile(t, CONFIDENCE, method="inverted_cdf")) * spread / math.sqrt(n)
 
 

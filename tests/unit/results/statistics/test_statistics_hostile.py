@@ -19,7 +19,7 @@ from invented.run_dirs import write_run
 from invented.simulated_entries import World, observed_scores, suite_samples
 from invented.study import write_suite
 
-from evopolicy_common.statistics.intervals import TOO_FEW_CASES
+from evopolicy_common.statistics.intervals import TOO_FEW_CASES, over_cases
 from evopolicy_results.notebook import figures_of, tables_of
 from evopolicy_results.scoring.scores import Cell, RunReturns, Scale, heldout_returns
 from evopolicy_results.statistics.aggregates import NO_SCALE, Aggregate, aggregates
@@ -457,3 +457,8 @@ def test_selection_optimism_is_validation_minus_heldout(tmp_path: Path) -> None:
     (one,) = study([tmp_path / "runs"]).suites[0].statistics.generalisation
     assert (one.train, one.validation, one.heldout, one.optimism) == (-90.0, -95.0, -105.0, 10.0)
     assert one.normalised_optimism == pytest.approx(10.0 / 395.0)
+
+
+def test_rounding_errors_of_constant_resamples_are_no_spread() -> None:
+    found = over_cases(np.array([-73.0, -68.0] + [-80.0] * 10))
+    assert (found.low, found.reason) == (None, TOO_FEW_CASES)
