@@ -38,8 +38,9 @@ _COORDINATOR = """
     versions.env versions.env_deterministic versions.fingerprint versions.fingerprint_overrides versions.installations
     versions.data_train_hash versions.data_valid_hash versions.data_heldout_hash
 """
-TOLD = (*_COORDINATOR.split(), *_GATEWAY.split())
-"""Fields of `run.json` that only the publisher's programs state. A journal entry fixes them when the run ends."""
+TOLD = (*_COORDINATOR.split(), *_GATEWAY.split(), "submits.status")
+"""Fields of `run.json`, and of `result.json` the last, that only the publisher's programs state. A journal entry fixes
+them when the run ends."""
 _RUN: dict[Cover, str] = {
     "derived": "**",
     "told": " ".join(f"{path} {path}.**" for path in _GATEWAY.split()),

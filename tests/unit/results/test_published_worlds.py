@@ -75,5 +75,6 @@ def test_model_tokens_jail_and_isolation_are_listed_as_the_publishers_word() -> 
         "jail",
         "hidden_isolation",
         "outcome.heldout_successes",
+        "submits.status",
     )
     assert set(named) <= set(fields.TOLD)
