@@ -58,11 +58,11 @@ def test_a_slots_whole_life(slots: Slots, monkeypatch: pytest.MonkeyPatch) -> No
 
     slots.run(life())
     assert " ".join(lines) == (
-        "> Start < Ready > Describe < Described"
+        "> SlotStart < SlotReady > Describe < Described"
         " > Play < Acting < Finished < Acting < Finished < Played"
         " > Play > Cancel < Played"
         " > Play it is not started again by itself"
-        " > Start < Ready"
+        " > SlotStart < SlotReady"
     )
 
 
