@@ -1,7 +1,7 @@
 """Plays tests in processes that are forked from one that has imported and collected them all.
 
 Each file of tests is played by one process, which sets up the fixtures of its modules once. Files are begun in the
-order of the collected tests.
+order of the collected tests; those with the mark `alone`, which look at the whole machine, when all others have ended.
 """
 
 from __future__ import annotations
@@ -40,7 +40,11 @@ class Parallel:
         groups: dict[object, deque[int]] = {}
         for place, item in enumerate(session.items):
             groups.setdefault(group(item), deque()).append(place)
-        self._waiting = deque(groups.values())
+        self._waiting = deque[deque[int]]()
+        self._alone = deque[deque[int]]()
+        for tests in groups.values():
+            is_alone = session.items[tests[0]].get_closest_marker("alone")
+            (self._alone if is_alone else self._waiting).append(tests)
         self._playing: dict[Connection, _Process] = {}
         self._started = 0
 
@@ -48,12 +52,14 @@ class Parallel:
         """Plays all tests in at most that many processes."""
         self._session.config.pluginmanager.getplugin("terminalreporter").showfspath = False
         try:
-            for _ in range(min(processes, len(self._waiting))):
-                self._start()
-            while self._playing:
-                for ready in wait([*self._playing]):
-                    assert isinstance(ready, Connection)
-                    self._receive(ready)
+            for tests, most in ((self._waiting, processes), (self._alone, 1)):
+                self._waiting = tests
+                for _ in range(min(most, len(self._waiting))):
+                    self._start()
+                while self._playing:
+                    for ready in wait([*self._playing]):
+                        assert isinstance(ready, Connection)
+                        self._receive(ready)
         finally:
             # At the end of its connection a process ends its test and its fixtures; Ctrl-C in a terminal goes to all.
             for connection, process in self._playing.items():

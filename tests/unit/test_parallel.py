@@ -42,6 +42,14 @@ def test_before(): pass
 def test_dies(): os._exit(7)
 def test_after(): pass
 """,
+    "test_alone.py": """
+import os
+import pytest
+
+pytestmark = pytest.mark.alone
+
+def test_no_other_process_lives(): assert open("torn_down").read() == "once "
+""",
     "test_shared.py": """
 import os
 import pytest
@@ -72,6 +80,7 @@ def test_each_test_is_reported_once_also_those_of_a_process_that_dies(tmp_path: 
     assert sorted(outcomes) == [
         ("FAILED", "test_dying.py::test_dies"),
         ("FAILED", "test_plain.py::test_fails"),
+        ("PASSED", "test_alone.py::test_no_other_process_lives"),
         ("PASSED", "test_dying.py::test_after"),
         ("PASSED", "test_dying.py::test_before"),
         ("PASSED", "test_plain.py::test_passes"),

@@ -28,7 +28,7 @@ from waiting import TIMEOUT_S, wait_until
 from evopolicy_common.records.run_record import RunRecord, decode_run_record
 from evopolicy_gateway.run_folder.layout import RunFolder
 
-pytestmark = [pytest.mark.system, pytest.mark.slow]
+pytestmark = [pytest.mark.system, pytest.mark.slow, pytest.mark.alone]
 
 PROGRAMS = Path(__file__).with_name("programs")
 POLICY = PROGRAMS / "signalling_policy.py"
