@@ -96,6 +96,7 @@ LOCAL = ["evopolicy", "local", "--env", "toy", "--agent"]
         ([*LOCAL, "evolve", "--budget", "0"], "'--budget': '0' is less than 1"),
         ([*LOCAL, "evolve", "--slots", "2000"], "'--slots': '2000' is more than 1024"),
         ([*LOCAL, "evolve", "--min-episodes", "2"], "give it as --set min_episodes=VALUE"),
+        ([*LOCAL, "evolve", "--repeated", "2"], "local --help"),
         ([*LOCAL, "mine.toml"], "write --agent file:mine.toml"),
         ([*LOCAL, "run.py 3"], "write --agent 'command:python3 run.py 3'"),
         ([*LOCAL, "sh run"], "write --agent 'command:sh run'"),

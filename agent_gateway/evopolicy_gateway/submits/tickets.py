@@ -135,6 +135,7 @@ class TicketMachine:
         self.tickets: list[Ticket] = []
         """Accepted submits by index, followed by at most one that is not accepted yet."""
         self.n_settled = 0
+        """Submits with a verdict."""
         self.n_rejected = 0
         self.in_flight_s = 0.0
         """Seconds in which a submit was in flight, in this process."""

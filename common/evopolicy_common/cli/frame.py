@@ -211,6 +211,6 @@ def _usage_text(error: TyperException) -> str:
         return text
     name = getattr(error, "option_name", "").lstrip("-").replace("-", "_")
     settings = next((each.help for each in context.command.params if "--set" in each.opts), "")
-    if name and re.search(rf"\b{re.escape(name)}\b", settings):
+    if name and re.search(rf"[:,] {re.escape(name)}[,;]", settings):
         return f"{text.rstrip('.')}; give it as --set {name}=VALUE"
     return f"{text.rstrip('.')}; see {context.command_path} --help"
